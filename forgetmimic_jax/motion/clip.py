@@ -1,0 +1,138 @@
+"""One motion of one robot on the host, and its file: an uncompressed NPZ."""
+
+from __future__ import annotations
+
+import io
+import os
+import tempfile
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from forgetmimic_jax.errors import InputError
+
+FIELDS = ("fps", "joint_names", "root_pos", "root_quat", "joint_pos")
+# Coarser than the last bits that differ between machines' linear algebra, so that a clip regenerates bit for bit;
+# 1e-5 rad or m is far below what a motor or a foot can tell.
+DECIMALS = 5
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A motion of one robot: the floating base's pose in the world (z up) and the joint angles of every frame."""
+
+    name: str
+    fps: float
+    joint_names: tuple[str, ...]
+    root_pos: np.ndarray  # [frame, 3] m
+    root_quat: np.ndarray  # [frame, 4] wxyz
+    joint_pos: np.ndarray  # [frame, joint] rad
+
+    @property
+    def num_frames(self) -> int:
+        return len(self.root_pos)
+
+    @property
+    def seconds(self) -> float:
+        """Duration in s: a frame stands for one control step."""
+        return self.num_frames / self.fps
+
+
+def validated(clip: Clip, source: str) -> Clip:
+    """The clip with unit quaternions on one continuous branch, or an InputError that names `source` and the field."""
+    frames = len(clip.root_pos)
+    if not np.isfinite(clip.fps) or clip.fps <= 0:
+        raise InputError(f"{source}: fps: found {clip.fps}; a positive number of frames per second is needed")
+    shapes = {"root_pos": (frames, 3), "root_quat": (frames, 4), "joint_pos": (frames, len(clip.joint_names))}
+    for field, shape in shapes.items():
+        value = getattr(clip, field)
+        if value.shape != shape:
+            raise InputError(f"{source}: {field}: found shape {list(value.shape)}; {list(shape)} is needed")
+        if not np.isfinite(value).all():
+            frame = int(np.argwhere(~np.isfinite(value))[0][0])
+            raise InputError(f"{source}: {field}: NaN or infinity in frame {frame}; every number must be finite")
+    if frames < 2:
+        raise InputError(f"{source}: found {frames} frame(s); a clip needs at least 2")
+    norm = np.linalg.norm(clip.root_quat, axis=-1)
+    if (np.abs(norm - 1.0) > 0.05).any():
+        frame = int(np.argmax(np.abs(norm - 1.0)))
+        raise InputError(f"{source}: root_quat: norm {norm[frame]:.3g} in frame {frame}; unit quaternions are needed")
+    quat = continuous(clip.root_quat / norm[:, None])
+    return Clip(clip.name, float(clip.fps), tuple(clip.joint_names), clip.root_pos, quat, clip.joint_pos)
+
+
+def continuous(quat: np.ndarray) -> np.ndarray:
+    """Quaternions [frame, 4] with signs flipped so that neighbours lie in one hemisphere."""
+    flips = np.sign(np.sum(quat[1:] * quat[:-1], axis=-1))
+    signs = np.cumprod(np.concatenate([[1.0], np.where(flips == 0, 1.0, flips)]))
+    return quat * signs[:, None]
+
+
+def rounded(clip: Clip) -> Clip:
+    """The clip as its file holds it: rounded, then float32."""
+
+    def cut(values: np.ndarray) -> np.ndarray:
+        return (np.round(values, DECIMALS) + 0.0).astype(np.float32)  # + 0.0 turns -0.0 into 0.0
+
+    return Clip(
+        clip.name, float(clip.fps), clip.joint_names, cut(clip.root_pos), cut(clip.root_quat), cut(clip.joint_pos)
+    )
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write a file so that a reader, or a crash, sees the old content or the new, never a part."""
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def write_clip(clip: Clip, path: Path) -> None:
+    """Write NAME.npz; the bytes depend on the clip alone (np.savez dates its members 1980)."""
+    clip = rounded(clip)
+    buffer = io.BytesIO()
+    np.savez(
+        buffer,
+        fps=np.float64(clip.fps),
+        joint_names=np.array(clip.joint_names),
+        root_pos=clip.root_pos,
+        root_quat=clip.root_quat,
+        joint_pos=clip.joint_pos,
+    )
+    write_atomically(path, buffer.getvalue())
+
+
+def read_clip(path: Path) -> Clip:
+    """Read a library's NAME.npz.
+
+    Raises:
+        InputError: not an NPZ, a missing field, or numbers that are no motion.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            missing = [field for field in FIELDS if field not in archive]
+            if missing:
+                raise InputError(f"{path}: missing {', '.join(missing)}; a clip holds {', '.join(FIELDS)}")
+            content = {field: archive[field] for field in FIELDS}
+    except (ValueError, zipfile.BadZipFile, EOFError) as error:
+        raise InputError(f"{path}: not a clip NPZ ({error})") from error
+    return validated(
+        Clip(
+            name=path.stem,
+            fps=float(content["fps"]),
+            joint_names=tuple(str(joint) for joint in content["joint_names"]),
+            root_pos=content["root_pos"].astype(np.float64),
+            root_quat=content["root_quat"].astype(np.float64),
+            joint_pos=content["joint_pos"].astype(np.float64),
+        ),
+        str(path),
+    )

@@ -1,0 +1,166 @@
+"""Motion arithmetic on the host: differences inside one clip, resampling, tiling of cycles, forward kinematics.
+
+Quaternions are wxyz; positions m; angles rad; z is up. Leading dimension: frame.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from forgetmimic_jax.motion.clip import Clip, continuous
+from forgetmimic_jax.robot import Robot
+
+
+def rotation(quat: np.ndarray) -> Rotation:
+    """scipy Rotation of wxyz quaternions [..., 4]."""
+    return Rotation.from_quat(quat, scalar_first=True)
+
+
+def quaternion(rotation: Rotation) -> np.ndarray:
+    """Continuous wxyz quaternions [frame, 4] of a scipy Rotation."""
+    return continuous(rotation.as_quat(scalar_first=True))
+
+
+def rate(values: np.ndarray, fps: float) -> np.ndarray:
+    """Time derivative of [frame, ...] by central differences, one-sided at both ends."""
+    return np.gradient(values, 1.0 / fps, axis=0)
+
+
+def angular_velocity(quat: np.ndarray, fps: float) -> np.ndarray:
+    """World-frame angular velocity [frame, 3] rad/s of orientations [frame, 4], differenced as `rate` does."""
+    turns = rotation(quat)
+    frames = len(quat)
+    after = np.minimum(np.arange(frames) + 1, frames - 1)
+    before = np.maximum(np.arange(frames) - 1, 0)
+    return (turns[after] * turns[before].inv()).as_rotvec() * (fps / (after - before))[:, None]
+
+
+def resample(clip: Clip, fps: float) -> Clip:
+    """The clip at another rate: linear in positions and joint angles, slerp in the root's orientation."""
+    times = np.arange(clip.num_frames) / clip.fps
+    count = int(np.floor(times[-1] * fps + 1e-6)) + 1
+    new_times = np.minimum(np.arange(count) / fps, times[-1])
+    return Clip(
+        name=clip.name,
+        fps=fps,
+        joint_names=clip.joint_names,
+        root_pos=interpolate(new_times, times, clip.root_pos),
+        root_quat=quaternion(Slerp(times, rotation(clip.root_quat))(new_times)),
+        joint_pos=interpolate(new_times, times, clip.joint_pos),
+    )
+
+
+def interpolate(new_times: np.ndarray, times: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Linear interpolation of [frame, ...] along time."""
+    flat = values.reshape(len(values), -1)
+    columns = [np.interp(new_times, times, column) for column in flat.T]
+    return np.stack(columns, axis=-1).reshape(len(new_times), *values.shape[1:])
+
+
+def heading(turns: Rotation) -> np.ndarray:
+    """Yaw [...] rad of orientations: the turn about z (the twist of the swing-twist split)."""
+    quat = turns.as_quat(scalar_first=True)
+    return 2.0 * np.arctan2(quat[..., 3], quat[..., 0])
+
+
+def wrap_angle(angle: np.ndarray) -> np.ndarray:
+    """Angle mapped to [-pi, pi)."""
+    return (angle + np.pi) % (2.0 * np.pi) - np.pi
+
+
+class PlanarTransform(NamedTuple):
+    """A turn by `yaw` rad about the world's z, then a shift [2] m in the plane."""
+
+    yaw: float
+    shift: np.ndarray
+
+    def power(self, count: int) -> PlanarTransform:
+        """The transform applied `count` times."""
+        result = PlanarTransform(0.0, np.zeros(2))
+        for _ in range(count):
+            result = PlanarTransform(result.yaw + self.yaw, turn(self.yaw, result.shift) + self.shift)
+        return result
+
+    def apply(self, pos: np.ndarray) -> np.ndarray:
+        """Positions [..., 3] moved."""
+        return np.concatenate([turn(self.yaw, pos[..., :2]) + self.shift, pos[..., 2:]], axis=-1)
+
+    def turn(self, turns: Rotation) -> Rotation:
+        """Orientations turned."""
+        return Rotation.from_rotvec([0.0, 0.0, self.yaw]) * turns
+
+
+def turn(yaw: float, plane: np.ndarray) -> np.ndarray:
+    """Planar vectors [..., 2] turned by yaw rad."""
+    cosine, sine = np.cos(yaw), np.sin(yaw)
+    return plane @ np.array([[cosine, sine], [-sine, cosine]])
+
+
+def tile(clip: Clip, step: PlanarTransform, seconds: float) -> Clip:
+    """Repeat one cycle until `seconds` are full.
+
+    The cycle holds frames 0 … n-1; frame n would be frame 0 moved by `step`. Each further cycle is the first one
+    moved by `step` once more, so a cycle whose motion is smooth across that seam is smooth for the whole clip.
+    """
+    count = round(seconds * clip.fps)
+    cycles = -(-count // clip.num_frames)
+    moves = [step.power(cycle) for cycle in range(cycles)]
+    turns = rotation(clip.root_quat)
+    return Clip(
+        name=clip.name,
+        fps=clip.fps,
+        joint_names=clip.joint_names,
+        root_pos=np.concatenate([move.apply(clip.root_pos) for move in moves])[:count],
+        root_quat=quaternion(Rotation.concatenate([move.turn(turns) for move in moves])[:count]),
+        joint_pos=np.tile(clip.joint_pos, (cycles, 1))[:count],
+    )
+
+
+class BodyMotion(NamedTuple):
+    """Poses and velocities of some bodies, world frame, at the bodies' origins."""
+
+    pos: np.ndarray  # [frame, body, 3] m
+    quat: np.ndarray  # [frame, body, 4] wxyz
+    lin_vel: np.ndarray  # [frame, body, 3] m/s
+    ang_vel: np.ndarray  # [frame, body, 3] rad/s
+
+
+def configuration(clip: Clip, robot: Robot) -> np.ndarray:
+    """MuJoCo's qpos [frame, 7 + joint], joints matched by name."""
+    order = [clip.joint_names.index(joint) for joint in robot.joint_names]
+    return np.concatenate([clip.root_pos, clip.root_quat, clip.joint_pos[:, order]], axis=-1)
+
+
+def generalized_velocity(qpos: np.ndarray, fps: float) -> np.ndarray:
+    """MuJoCo's qvel [frame, 6 + joint] of qpos: root linear in the world, root angular in the root's frame."""
+    world = angular_velocity(qpos[:, 3:7], fps)
+    local = rotation(qpos[:, 3:7]).inv().apply(world)
+    return np.concatenate([rate(qpos[:, :3], fps), local, rate(qpos[:, 7:], fps)], axis=-1)
+
+
+def body_motion(model: mujoco.MjModel, qpos: np.ndarray, fps: float, body_ids: np.ndarray) -> BodyMotion:
+    """Forward kinematics of a clip.
+
+    Velocities follow from the differenced qpos through the Jacobian (mj_objectVelocity), so that a robot reset to
+    a frame's joint positions and velocities has exactly the reference's body velocities.
+    """
+    data = mujoco.MjData(model)
+    qvel = generalized_velocity(qpos, fps)
+    frames, bodies = len(qpos), len(body_ids)
+    pos, quat = np.empty((frames, bodies, 3)), np.empty((frames, bodies, 4))
+    velocity = np.empty((frames, bodies, 6))
+    one = np.empty(6)
+    for frame in range(frames):
+        data.qpos[:], data.qvel[:] = qpos[frame], qvel[frame]
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_comVel(model, data)
+        pos[frame], quat[frame] = data.xpos[body_ids], data.xquat[body_ids]
+        for row, body in enumerate(body_ids):
+            mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, body, one, 0)
+            velocity[frame, row] = one
+    return BodyMotion(pos, quat, velocity[..., 3:], velocity[..., :3])

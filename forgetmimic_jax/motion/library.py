@@ -1,0 +1,194 @@
+"""The motion library: clips of one robot as padded arrays [clip, frame, ...] for the training, and its folder.
+
+A folder holds one NAME.npz a clip and manifest.json with each file's hash, origin and settings.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from forgetmimic_jax.errors import InputError, nearest
+from forgetmimic_jax.motion.clip import Clip, read_clip, write_atomically
+from forgetmimic_jax.motion.kinematics import body_motion, configuration, rate, resample
+from forgetmimic_jax.robot import Robot
+
+DATA_DIR = Path(__file__).resolve().parents[2] / "data"
+MANIFEST = "manifest.json"
+SCHEMA = 1
+MAX_LINEAR_ACCELERATION = 50.0  # m/s^2, the assistive wrench's clip on the reference
+MAX_ANGULAR_ACCELERATION = 100.0  # rad/s^2
+
+
+@struct.dataclass
+class MotionLibrary:
+    """Reference motions of one robot; K key bodies, world frame, velocities at the bodies' origins.
+
+    Frames past a clip's end repeat its last frame.
+    """
+
+    length: Array  # i32[clip] frames of each clip
+    joint_pos: Array  # f32[clip, frame, joint] rad
+    joint_vel: Array  # f32[clip, frame, joint] rad/s
+    body_pos: Array  # f32[clip, frame, K, 3] m
+    body_quat: Array  # f32[clip, frame, K, 4] wxyz
+    body_lin_vel: Array  # f32[clip, frame, K, 3] m/s
+    body_ang_vel: Array  # f32[clip, frame, K, 3] rad/s
+    anchor_lin_acc: Array  # f32[clip, frame, 3] m/s^2, norm at most 50
+    anchor_ang_acc: Array  # f32[clip, frame, 3] rad/s^2, norm at most 100
+    names: tuple[str, ...] = struct.field(pytree_node=False)
+
+    @property
+    def num_clips(self) -> int:
+        return len(self.names)
+
+
+def build_library(robot: Robot, clips: Sequence[Clip], fps: float = 50.0) -> MotionLibrary:
+    """Resample clips to the control rate `fps` in Hz, derive body motion, and pad.
+
+    Raises:
+        InputError: no clip, or a clip with other joints than the robot's.
+    """
+    if not clips:
+        raise InputError("library: no clips; import or retarget one first")
+    rows = []
+    for clip in clips:
+        _check_joints(clip, robot)
+        rows.append(_arrays(robot, clip if clip.fps == fps else resample(clip, fps)))
+    longest = max(len(row["joint_pos"]) for row in rows)
+
+    def padded(field: str) -> Array:
+        stacked = [
+            np.pad(row[field], [(0, longest - len(row[field]))] + [(0, 0)] * (row[field].ndim - 1), mode="edge")
+            for row in rows
+        ]
+        return jnp.asarray(np.stack(stacked), jnp.float32)
+
+    return MotionLibrary(
+        length=jnp.asarray([len(row["joint_pos"]) for row in rows], jnp.int32),
+        names=tuple(clip.name for clip in clips),
+        **{field: padded(field) for field in rows[0]},
+    )
+
+
+def load_library(
+    robot: Robot, path: Path | None = None, clips: Sequence[str] | None = None, fps: float = 50.0
+) -> MotionLibrary:
+    """Load a library folder.
+
+    Args:
+        robot: whose clips they are.
+        path: the folder; data/ROBOT by default.
+        clips: names to load, in this order; all in the manifest's order by default.
+        fps: control rate in Hz; clips at another rate are resampled.
+
+    Raises:
+        InputError: no or empty library, another robot's, an unknown clip, or a file that differs from its hash.
+    """
+    return build_library(robot, read_library(robot, path, clips), fps)
+
+
+def read_library(robot: Robot, path: Path | None = None, clips: Sequence[str] | None = None) -> list[Clip]:
+    """The library's clips as they are on disk; arguments and errors as in `load_library`."""
+    path = DATA_DIR / robot.name if path is None else Path(path)
+    manifest = read_manifest(path)
+    if manifest["robot"] != robot.name:
+        raise InputError(f"{path / MANIFEST}: robot: found '{manifest['robot']}'; '{robot.name}' is needed")
+    known = list(manifest["clips"])
+    if not known:
+        raise InputError(f"{path / MANIFEST}: clips: the library is empty; import or retarget a clip first")
+    loaded = []
+    for name in known if clips is None else clips:
+        if name not in known:
+            raise InputError(f"{path}: no clip '{name}'; {nearest(name, known)}")
+        file = path / f"{name}.npz"
+        found = file_hash(file)
+        if found != manifest["clips"][name]["sha256"]:
+            raise InputError(
+                f"{file}: sha256 {found[:16]}… differs from the manifest's "
+                f"{manifest['clips'][name]['sha256'][:16]}…; the file was changed or damaged, import it again"
+            )
+        clip = read_clip(file)
+        _check_joints(clip, robot, str(file))
+        loaded.append(clip)
+    if not loaded:
+        raise InputError(f"{path}: no clip was asked for; known: {', '.join(known)}")
+    return loaded
+
+
+def read_manifest(path: Path) -> dict[str, Any]:
+    """The folder's manifest: robot, fps, schema and one entry a clip."""
+    file = path / MANIFEST
+    if not file.is_file():
+        raise InputError(f"{file}: not found; a library is a folder with {MANIFEST}")
+    try:
+        manifest = json.loads(file.read_text())
+    except ValueError as error:
+        raise InputError(f"{file}: not JSON ({error})") from error
+    for field in ("schema", "robot", "fps", "clips"):
+        if not isinstance(manifest, dict) or field not in manifest:
+            raise InputError(f"{file}: missing field '{field}'")
+    if manifest["schema"] != SCHEMA:
+        raise InputError(f"{file}: schema: found {manifest['schema']}; this version reads {SCHEMA}")
+    return manifest
+
+
+def write_manifest(path: Path, manifest: dict[str, Any]) -> None:
+    """Write the folder's manifest in one atomic step."""
+    write_atomically(path / MANIFEST, (json.dumps(manifest, indent=2) + "\n").encode())
+
+
+def file_hash(path: Path) -> str:
+    """sha256 of a file, hex."""
+    if not path.is_file():
+        raise InputError(f"{path}: not found, though the manifest lists it")
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def library_hash(path: Path) -> str:
+    """16 hex digits over the clips' names and contents: what a result was computed on."""
+    path = Path(path)
+    digest = hashlib.sha256()
+    for name in sorted(read_manifest(path)["clips"]):
+        digest.update(f"{name}\0{file_hash(path / f'{name}.npz')}\n".encode())
+    return digest.hexdigest()[:16]
+
+
+def _check_joints(clip: Clip, robot: Robot, source: str | None = None) -> None:
+    if set(clip.joint_names) != set(robot.joint_names):
+        missing = sorted(set(robot.joint_names) - set(clip.joint_names))
+        unknown = sorted(set(clip.joint_names) - set(robot.joint_names))
+        raise InputError(
+            f"{source or clip.name}: joint_names: found {len(clip.joint_names)} joints that are not the {robot.name}'s "
+            f"{robot.num_joints} (missing: {', '.join(missing[:3]) or 'none'}; "
+            f"unknown: {', '.join(unknown[:3]) or 'none'})"
+        )
+
+
+def _arrays(robot: Robot, clip: Clip) -> dict[str, np.ndarray]:
+    qpos = configuration(clip, robot)
+    bodies = body_motion(robot.model, qpos, clip.fps, robot.key_body_ids)
+    return {
+        "joint_pos": qpos[:, 7:],
+        "joint_vel": rate(qpos[:, 7:], clip.fps),
+        "body_pos": bodies.pos,
+        "body_quat": bodies.quat,
+        "body_lin_vel": bodies.lin_vel,
+        "body_ang_vel": bodies.ang_vel,
+        "anchor_lin_acc": _clipped(rate(bodies.lin_vel[:, robot.anchor], clip.fps), MAX_LINEAR_ACCELERATION),
+        "anchor_ang_acc": _clipped(rate(bodies.ang_vel[:, robot.anchor], clip.fps), MAX_ANGULAR_ACCELERATION),
+    }
+
+
+def _clipped(vectors: np.ndarray, limit: float) -> np.ndarray:
+    """Vectors [frame, 3] shortened to a norm of at most `limit`."""
+    norm = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors * np.minimum(1.0, limit / np.maximum(norm, 1e-9))
