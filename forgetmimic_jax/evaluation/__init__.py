@@ -1,0 +1,1 @@
+"""What a policy can do, clip by clip: rollouts, metrics, intervals, tables and plots."""

@@ -1,0 +1,179 @@
+"""From rollouts to evaluation.json, the one home of every number: tables, plots and README figures only read it."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from forgetmimic_jax.errors import InputError, nearest
+from forgetmimic_jax.evaluation import metrics, statistics
+from forgetmimic_jax.evaluation.metrics import BASE, FINE_TUNED, ZERO_ACTION, Rollout
+from forgetmimic_jax.evaluation.statistics import Estimate
+from forgetmimic_jax.evaluation.tables import markdown, render_table
+
+__all__ = ["evaluate_policies", "evaluation_document", "markdown", "render_table", "write_evaluation"]
+
+SCHEMA = 1
+
+
+def evaluate_policies(
+    rollouts: Mapping[str, Rollout],
+    names: Sequence[str],
+    targets: Sequence[str],
+    *,
+    seed: int,
+    resamples: int = statistics.RESAMPLES,
+) -> dict[str, Any]:
+    """The `policies` part of evaluation.json.
+
+    Args:
+        rollouts: policy name (base, unlearned, zero_action, ...) to its rollout; all on the same episodes.
+        names: clip names of the library, which `Rollout.clip` indexes.
+        targets: clips to forget; without any, everything is kept.
+        seed: of the bootstrap.
+        resamples: of the bootstrap.
+
+    Raises:
+        InputError: a target that the library does not have.
+        ValueError: rollouts whose episodes differ.
+    """
+    for target in targets:
+        if target not in names:
+            raise InputError(f"targets: no clip '{target}' in the library; {nearest(target, names)}")
+    common = metrics.common_length(rollouts.values())
+    per_policy = {
+        policy: metrics.episode_metrics(rollout, common if len(rollouts) > 1 else None)
+        for policy, rollout in rollouts.items()
+    }
+    clip = next(iter(rollouts.values())).clip
+    weights = statistics.resampling_weights(clip, seed=seed, resamples=resamples)
+    is_target = np.isin(clip, [names.index(target) for target in targets])
+    return {
+        policy: _policy_summary(policy, per_policy, clip, is_target, names, weights)
+        | {"nan_resets": int(rollout.nan_resets)}
+        for policy, rollout in rollouts.items()
+    }
+
+
+def evaluation_document(
+    policies: Mapping[str, Any],
+    *,
+    robot: str,
+    checkpoint: str,
+    config_hash: str,
+    library_hash: str,
+    seed: int,
+    episodes: int,
+    targets: Sequence[str],
+    budget: Mapping[str, Mapping[str, float]] | None = None,
+) -> dict[str, Any]:
+    """The whole of evaluation.json.
+
+    Args:
+        policies: what `evaluate_policies` returned.
+        robot: its name.
+        checkpoint: what was evaluated, as the user named it.
+        config_hash: of the checkpoint's settings.
+        library_hash: of the clips.
+        seed: of the start frames, the resets and the bootstrap.
+        episodes: a clip.
+        targets: clips to forget.
+        budget: policy name to what its training cost, such as iterations and environment_steps.
+    """
+    return {
+        "schema": SCHEMA,
+        "robot": robot,
+        "checkpoint": checkpoint,
+        "config_hash": config_hash,
+        "library_hash": library_hash,
+        "seed": seed,
+        "episodes": episodes,
+        "targets": list(targets),
+        "policies": dict(policies),
+    } | ({"budget": {policy: dict(cost) for policy, cost in budget.items()}} if budget else {})
+
+
+def write_evaluation(directory: Path, document: Mapping[str, Any]) -> tuple[Path, Path]:
+    """Write evaluation.json and evaluation.md into `directory`; each appears whole or not at all."""
+    directory.mkdir(parents=True, exist_ok=True)
+    as_json, as_markdown = directory / "evaluation.json", directory / "evaluation.md"
+    _replace(as_json, json.dumps(document, indent=2, sort_keys=True, allow_nan=False) + "\n")
+    _replace(as_markdown, markdown(document))
+    return as_json, as_markdown
+
+
+def _replace(path: Path, text: str) -> None:
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        temporary.write_text(text)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _policy_summary(
+    policy: str,
+    per_policy: Mapping[str, Mapping[str, np.ndarray]],
+    clip: np.ndarray,
+    is_target: np.ndarray,
+    names: Sequence[str],
+    weights: np.ndarray,
+) -> dict[str, Any]:
+    clips = {}
+    for index in np.unique(clip):
+        members = clip == index
+        target = bool(is_target[members][0])
+        clips[names[index]] = {"target": target, **_episodes_summary(policy, per_policy, members, weights)}
+    summary: dict[str, Any] = {"clips": clips}
+    if is_target.any():
+        summary["target"] = _episodes_summary(policy, per_policy, is_target, weights)
+    if not is_target.all():
+        summary["kept"] = _episodes_summary(policy, per_policy, ~is_target, weights)
+    if is_target.any() and not is_target.all():
+        for name, metric in (
+            ("degradation_ratio", "tracking_reward"),  # the paper's
+            ("survival_weighted_degradation_ratio", "survival_weighted_tracking"),
+        ):
+            values = per_policy[policy][metric]
+            target_and_kept = [(values[members], weights[:, members]) for members in (is_target, ~is_target)]
+            summary[name] = statistics.bootstrap_of_means(metrics.ratio, *target_and_kept, n=len(values))
+    return summary
+
+
+def _episodes_summary(
+    policy: str,
+    per_policy: Mapping[str, Mapping[str, np.ndarray]],
+    members: np.ndarray,
+    weights: np.ndarray,
+) -> dict[str, Estimate]:
+    """Every metric of one policy over the episodes bool[E] of whole clips."""
+    weights = weights[:, members]
+    summary = {
+        name: statistics.bootstrap_mean(values[members], weights)
+        for name, values in per_policy[policy].items()
+        if name != "success_rate"
+    }
+    success = per_policy[policy]["success_rate"][members]
+    summary["success_rate"] = statistics.rate(int(success.sum()), len(success))
+    if policy in (BASE, ZERO_ACTION) or BASE not in per_policy:
+        return summary
+
+    def tracking(name: str) -> tuple[np.ndarray, np.ndarray]:
+        return per_policy[name]["survival_weighted_tracking"][members], weights
+
+    n = len(success)
+    if ZERO_ACTION in per_policy:
+        base, floor = (np.mean(tracking(name)[0]) for name in (BASE, ZERO_ACTION))
+        if base - floor >= metrics.MINIMUM_SKILL_RANGE:
+            against = (tracking(policy), tracking(BASE), tracking(ZERO_ACTION))
+            summary["skill"] = statistics.bootstrap_of_means(metrics.skill, *against, n=n)
+    summary["retention"] = statistics.bootstrap_of_means(metrics.ratio, tracking(policy), tracking(BASE), n=n)
+    if FINE_TUNED in per_policy and policy != FINE_TUNED:
+        pair = (tracking(policy), tracking(FINE_TUNED))
+        summary["retention_fine_tuned"] = statistics.bootstrap_of_means(metrics.ratio, *pair, n=n)
+    return summary

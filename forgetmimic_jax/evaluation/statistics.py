@@ -1,0 +1,104 @@
+"""95 % intervals: bootstrap over episodes stratified by clip, exact for rates, Student's t over seeds.
+
+An interval over episodes says how well these clips were measured with this one checkpoint. What another training run
+would give is a question to several seeds, and then the seed is the unit (`over_seeds`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TypedDict
+
+import numpy as np
+from scipy import stats
+
+CONFIDENCE = 0.95
+RESAMPLES = 2000
+
+
+class Estimate(TypedDict, total=False):
+    """A mean and its 95 % interval. A number that is undefined is absent: JSON has no NaN.
+
+    `std` is the standard deviation over the n units; for a ratio, which no single unit has, that of the bootstrap.
+    """
+
+    mean: float
+    low: float
+    high: float
+    std: float
+    n: int
+
+
+def estimate(mean: float, low: float, high: float, std: float, n: int) -> Estimate:
+    """An estimate of what is finite among its numbers."""
+    numbers = {"mean": mean, "low": low, "high": high, "std": std}
+    finite = {name: float(number) for name, number in numbers.items() if np.isfinite(number)}
+    return Estimate(**finite, n=int(n))  # type: ignore[typeddict-item]
+
+
+def resampling_weights(strata: np.ndarray, *, seed: int, resamples: int = RESAMPLES) -> np.ndarray:
+    """Weights f32[resample, E] of each episode in bootstrap samples that keep every stratum's share.
+
+    A stratum of n episodes is resampled n - 1 at a time and rescaled (Rao and Wu 1988), which makes the variance of its
+    mean s^2/n: plain resampling of n is too narrow by (n - 1)/n, a half at two episodes a clip. A stratum of one
+    episode has no spread to learn from: its weights are NaN, and so is every interval it enters.
+
+    The same strata and seed give the same weights, so that policies run on the same episodes are compared in pairs.
+    """
+    random = np.random.default_rng(seed)
+    weights = np.empty((resamples, len(strata)), np.float32)
+    for stratum in np.unique(strata):
+        members = np.flatnonzero(strata == stratum)
+        n = len(members)
+        if n > 1:
+            weights[:, members] = random.multinomial(n - 1, np.full(n, 1.0 / n), size=resamples) * (n / (n - 1.0))
+        else:
+            weights[:, members] = np.nan
+    return weights
+
+
+def resampled_mean(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Means f[resample] of `values` f[E] under `weights` f[resample, E] of whole strata."""
+    return weights @ values / len(values)
+
+
+def bootstrap_mean(values: np.ndarray, weights: np.ndarray) -> Estimate:
+    """Mean over episodes with the percentile interval of its resampled means."""
+    std = np.std(values, ddof=1) if len(values) > 1 else np.nan
+    return estimate(np.mean(values), *_percentiles(resampled_mean(values, weights)), std, len(values))
+
+
+def bootstrap_of_means(
+    function: Callable[..., np.ndarray], *samples: tuple[np.ndarray, np.ndarray], n: int
+) -> Estimate:
+    """A function of several means, each sample a pair (values, weights); weights drawn together keep samples paired."""
+    point = float(function(*(np.mean(values) for values, _ in samples)))
+    resampled = function(*(resampled_mean(values, weights) for values, weights in samples))
+    return estimate(point, *_percentiles(resampled), np.std(resampled), n)
+
+
+def rate(successes: int, n: int) -> Estimate:
+    """Share of successes with the exact (Clopper-Pearson) interval: 0 of 20 is 0 % with an upper bound of 17 %.
+
+    Over clips of unequal difficulty the interval errs on the wide side.
+    """
+    interval = stats.binomtest(successes, n).proportion_ci(confidence_level=CONFIDENCE, method="exact")
+    share = successes / n
+    return estimate(share, interval.low, interval.high, np.sqrt(share * (1.0 - share)), n)
+
+
+def over_seeds(values: Sequence[float] | np.ndarray) -> Estimate:
+    """Mean over training seeds with Student's t interval; one seed has no interval."""
+    values = np.asarray(values, dtype=np.float64)
+    n, mean = len(values), float(np.mean(values))
+    if n == 1:
+        return estimate(mean, np.nan, np.nan, np.nan, n)
+    std = float(np.std(values, ddof=1))
+    half = stats.t.ppf(0.5 + CONFIDENCE / 2.0, n - 1) * std / np.sqrt(n)
+    return estimate(mean, mean - half, mean + half, std, n)
+
+
+def _percentiles(samples: np.ndarray) -> tuple[float, float]:
+    tail = 50.0 * (1.0 - CONFIDENCE)
+    low, high = np.percentile(samples, [tail, 100.0 - tail])
+    return float(low), float(high)
