@@ -1,0 +1,103 @@
+"""The protocol both engines keep. Leading dimension of every array: environment.
+
+An engine is stateless: what goes in decides what comes out, so a rollout can be stopped, saved and resumed.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, Protocol
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import Array
+
+from forgetmimic_jax import rotation
+from forgetmimic_jax.config import PhysicsConfig
+from forgetmimic_jax.robot import Robot
+
+
+@struct.dataclass
+class PhysicsState:
+    """All that a simulation step needs from the step before it."""
+
+    qpos: Array  # [env, 7 + joint] root position m, root quaternion, joint positions rad
+    qvel: Array  # [env, 6 + joint] root linear velocity (world), root angular velocity (root frame), joint velocities
+    warmstart: Array  # [env, 6 + joint] the last physics step's acceleration, where the solver starts
+
+
+@struct.dataclass
+class PhysicsParameters:
+    """What randomisation changes in the model, per environment."""
+
+    foot_friction: Array  # [env] sliding friction of the soles
+    torso_com: Array  # [env, 3] m, offset of the anchor body's centre of mass
+
+
+@struct.dataclass
+class BodyState:
+    """Key bodies in the world frame; velocities at the body's origin."""
+
+    pos: Array  # [env, key_body, 3] m
+    quat: Array  # [env, key_body, 4] wxyz
+    lin_vel: Array  # [env, key_body, 3] m/s
+    ang_vel: Array  # [env, key_body, 3] rad/s
+    contact_force: Array  # [env, key_body, 3] N, from the floor, during the last physics step
+
+
+class Engine(Protocol):
+    """Steps and forward kinematics of a batch of robots; pure in the JAX sense."""
+
+    def step(
+        self, state: PhysicsState, parameters: PhysicsParameters, target: Array, wrench: Array
+    ) -> tuple[PhysicsState, BodyState]:
+        """One control step.
+
+        Args:
+            state: state before the step.
+            parameters: randomised model values.
+            target: [env, joint] rad, position targets of the PD loops.
+            wrench: [env, 6] N and N m in the world frame, on the anchor body at its centre of mass.
+
+        Returns:
+            The state after the step, and the key bodies there.
+        """
+        ...
+
+    def forward(self, state: PhysicsState, parameters: PhysicsParameters, mask: Array, bodies: BodyState) -> BodyState:
+        """Key bodies of `state` where mask [env] holds, `bodies` elsewhere; contact forces there are zero."""
+        ...
+
+
+def body_state(xpos: Array, xquat: Array, cvel: Array, com: Array, contact_force: Array) -> BodyState:
+    """Key-body velocities at the bodies' origins from MuJoCo's spatial velocity about the robot's centre of mass.
+
+    Args:
+        xpos: [env, key_body, 3] m.
+        xquat: [env, key_body, 4].
+        cvel: [env, key_body, 6] angular then linear, world axes, at `com`.
+        com: [env, 3] m.
+        contact_force: [env, key_body, 3] N.
+    """
+    ang_vel, lin_vel_com = cvel[..., :3], cvel[..., 3:]
+    lin_vel = lin_vel_com + jnp.cross(ang_vel, xpos - com[:, None])
+    return BodyState(pos=xpos, quat=rotation.normalize(xquat), lin_vel=lin_vel, ang_vel=ang_vel, contact_force=contact_force)
+
+
+def resolve_engine(name: Literal["auto", "native", "mjx", "mjx-warp"]) -> str:
+    """`auto` becomes native on a CPU and mjx on a GPU or TPU."""
+    if name != "auto":
+        return name
+    return "native" if jax.default_backend() == "cpu" else "mjx"
+
+
+def make_engine(robot: Robot, config: PhysicsConfig, num_envs: int) -> Engine:
+    """The engine that `config.engine` names, for a batch of `num_envs` robots."""
+    name = resolve_engine(config.engine)
+    if name == "native":
+        from forgetmimic_jax.physics.native import NativeEngine
+
+        return NativeEngine(robot, config.substeps, num_envs)
+    from forgetmimic_jax.physics.mjx import MjxEngine
+
+    return MjxEngine(robot, config.substeps, implementation="warp" if name == "mjx-warp" else "jax")

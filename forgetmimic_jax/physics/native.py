@@ -1,0 +1,109 @@
+"""MuJoCo's C engine on all CPU cores (`mujoco.batch`) behind a pure callback: the default engine on a CPU."""
+
+from __future__ import annotations
+
+import threading
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import mujoco.batch
+import numpy as np
+from jax import Array
+
+from forgetmimic_jax.physics.engine import BodyState, PhysicsParameters, PhysicsState, body_state
+from forgetmimic_jax.robot import Robot
+
+_VELOCITY_STAGE = int(mujoco.mjtStage.mjSTAGE_VEL)
+
+
+class NativeEngine:
+    """A `mujoco.batch.Batch` whose rows are only scratch: every call loads the state it is given.
+
+    Purity is what allows `jax.pure_callback`: nothing of one call is felt by the next.
+    """
+
+    def __init__(self, robot: Robot, substeps: int, num_envs: int, num_threads: int = 0):
+        model = robot.model
+        # A diverged simulation must show as NaN, to be counted; MuJoCo's own reset would hide it.
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        mujoco.set_mju_user_warning(lambda message: None)
+        self._batch = mujoco.batch.Batch(model, num_envs, num_threads)
+        self._lock = threading.Lock()
+        self._substeps = substeps
+        self._keys = robot.key_body_ids
+        self._anchor = robot.anchor_body_id
+        self._torso_com = model.body_ipos[self._anchor].copy()
+        self._feet = robot.foot_geom_ids
+        self._num_envs = num_envs
+        self._outputs = {name: self._batch.bind(name) for name in ("xpos", "xquat", "cvel", "subtree_com", "sensordata")}
+        self._friction = self._batch.expand("geom_friction")
+        self._body_ipos = self._batch.expand("body_ipos")
+        keys = len(self._keys)
+
+        def shape(*dims: int) -> jax.ShapeDtypeStruct:
+            return jax.ShapeDtypeStruct((num_envs, *dims), jnp.float32)
+
+        self._state_shapes = (shape(model.nq), shape(model.nv), shape(model.nv))
+        self._body_shapes = (shape(keys, 3), shape(keys, 4), shape(keys, 6), shape(3))
+        self._force_shape = shape(keys, 3)
+
+    def step(
+        self, state: PhysicsState, parameters: PhysicsParameters, target: Array, wrench: Array
+    ) -> tuple[PhysicsState, BodyState]:
+        """See `Engine.step`."""
+        shapes = (*self._state_shapes, *self._body_shapes, self._force_shape)
+        qpos, qvel, warmstart, xpos, xquat, cvel, com, force = jax.pure_callback(
+            self._step_host,
+            shapes,
+            (state.qpos, state.qvel, state.warmstart, parameters.foot_friction, parameters.torso_com, target, wrench),
+        )
+        return PhysicsState(qpos, qvel, warmstart), body_state(xpos, xquat, cvel, com, force)
+
+    def forward(self, state: PhysicsState, parameters: PhysicsParameters, mask: Array, bodies: BodyState) -> BodyState:
+        """See `Engine.forward`."""
+        xpos, xquat, cvel, com = jax.pure_callback(
+            self._forward_host,
+            self._body_shapes,
+            (state.qpos, state.qvel, state.warmstart, parameters.foot_friction, parameters.torso_com, mask),
+        )
+        fresh = body_state(xpos, xquat, cvel, com, jnp.zeros_like(bodies.contact_force))
+        return jax.tree.map(lambda new, old: jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old), fresh, bodies)
+
+    def _load(self, qpos, qvel, warmstart, friction, torso_com) -> None:
+        batch = self._batch
+        batch.qpos[:] = qpos
+        batch.qvel[:] = qvel
+        batch.qacc_warmstart[:] = warmstart
+        self._friction[:, self._feet, 0] = np.asarray(friction)[:, None]
+        self._body_ipos[:, self._anchor] = self._torso_com + np.asarray(torso_com)
+
+    def _bodies(self) -> tuple[np.ndarray, ...]:
+        out = self._outputs
+        return (
+            out["xpos"][:, self._keys].astype(np.float32),
+            out["xquat"][:, self._keys].astype(np.float32),
+            out["cvel"][:, self._keys].astype(np.float32),
+            out["subtree_com"][:, 1].astype(np.float32),
+        )
+
+    def _step_host(self, arguments) -> tuple[np.ndarray, ...]:
+        qpos, qvel, warmstart, friction, torso_com, target, wrench = arguments
+        with self._lock:
+            batch = self._batch
+            self._load(qpos, qvel, warmstart, friction, torso_com)
+            batch.ctrl[:] = target
+            batch.xfrc_applied[:, self._anchor] = wrench
+            batch.step(nstep=self._substeps, stage=_VELOCITY_STAGE)
+            force = self._outputs["sensordata"].reshape(self._num_envs, -1, 3).astype(np.float32)
+            state = tuple(x.astype(np.float32) for x in (batch.qpos, batch.qvel, batch.qacc_warmstart))
+            return (*state, *self._bodies(), force)
+
+    def _forward_host(self, arguments) -> tuple[np.ndarray, ...]:
+        qpos, qvel, warmstart, friction, torso_com, mask = arguments
+        with self._lock:
+            ids = np.flatnonzero(np.asarray(mask))
+            if ids.size:
+                self._load(qpos, qvel, warmstart, friction, torso_com)
+                self._batch.forward(ids=ids.astype(np.int32), stage=_VELOCITY_STAGE)
+            return self._bodies()

@@ -1,0 +1,265 @@
+"""The environment: a batch of robots that track clips. Pure functions over EnvState.
+
+`step` moves the robots and tells reward and ending; `reset_where` starts new episodes where asked. Keeping them
+apart lets training bootstrap the value of a truncated episode's last state, and lets evaluation not reset at all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import Array
+
+from forgetmimic_jax.config import Config
+from forgetmimic_jax.motion.library import MotionLibrary
+from forgetmimic_jax.physics import BodyState, Engine, PhysicsParameters, PhysicsState, make_engine
+from forgetmimic_jax.robot import Robot, RobotArrays
+from forgetmimic_jax.tracking import observation, randomise, reward
+from forgetmimic_jax.tracking.reference import Reference, align_to_anchor, lookup
+from forgetmimic_jax.tracking.rsi import Bins, make_bins, sample_start
+from forgetmimic_jax.tracking.termination import terminations
+from forgetmimic_jax.tracking.wrench import reference_wrench
+
+
+@struct.dataclass
+class Assets:
+    """Constant arrays of a run; traced arguments of the jitted functions, never baked into them."""
+
+    robot: RobotArrays
+    library: MotionLibrary
+    bins: Bins
+    is_target: Array  # bool[clip] the clips to forget
+
+
+@struct.dataclass
+class EnvState:
+    """A batch of running episodes. Leading dimension: env."""
+
+    physics: PhysicsState
+    bodies: BodyState
+    parameters: PhysicsParameters
+    clip: Array  # i32
+    frame: Array  # i32 the reference frame the robot is at; the next action is to reach frame + 1
+    start_bin: Array  # i32
+    step: Array  # i32 steps lived
+    horizon: Array  # i32 steps the episode can live: min(max_episode_steps, frames left)
+    tracking_sum: Array  # f32 Σ r̄ so far
+    last_action: Array  # f32[env, joint]
+    encoder_bias: Array  # f32[env, joint] rad
+    wrench_gain: Array  # f32 β, frozen for the episode
+    push_countdown: Array  # i32 control steps to the next push
+    terms: Array  # f32[env, term] last tracking kernels
+
+
+@struct.dataclass
+class StepResult:
+    """What a step tells, before any reset. Leading dimension: env."""
+
+    reward: reward.Reward
+    terminated: Array  # bool: a bound was broken, or the physics diverged
+    truncated: Array  # bool: the clip or the time ended
+    diverged: Array  # bool: NaN or Inf in the physics
+    causes: dict[str, Array]  # bool, which bound
+    reference: Reference  # the frame that was tracked
+
+
+@dataclass(frozen=True)
+class Environment:
+    """What is fixed when the functions are traced: the engine and small host constants."""
+
+    config: Config
+    robot: Robot
+    engine: Engine
+    num_envs: int
+    noisy: bool  # reset noise, pushes, randomisation and observation noise
+
+    @property
+    def control_step(self) -> float:
+        return self.config.physics.timestep * self.config.physics.substeps
+
+    @property
+    def nominal_friction(self) -> float:
+        return float(self.robot.model.geom_friction[self.robot.foot_geom_ids[0], 0])
+
+
+def make_environment(config: Config, robot: Robot, num_envs: int, *, noisy: bool | None = None) -> Environment:
+    """An environment of `num_envs` robots; `noisy` defaults to the config's."""
+    engine = make_engine(robot, config.physics, num_envs)
+    return Environment(config, robot, engine, num_envs, config.noise.enabled if noisy is None else noisy)
+
+
+def make_assets(config: Config, robot: Robot, library: MotionLibrary) -> Assets:
+    """The constant arrays of a run."""
+    step = config.physics.timestep * config.physics.substeps
+    return Assets(
+        robot=robot.arrays,
+        library=library,
+        bins=make_bins(library, config.sampling.bin_seconds, step),
+        is_target=jnp.asarray([name in config.unlearn.targets for name in library.names]),
+    )
+
+
+def start_episodes(
+    env: Environment, assets: Assets, key: Array, clip: Array, start_bin: Array, frame: Array, wrench_gain: Array
+) -> EnvState:
+    """Fresh episodes [env] at the given clips and frames, with reset noise. Bodies: see `refresh_bodies`."""
+    noise, n, joints = env.config.noise, env.num_envs, env.robot.num_joints
+    keys = jax.random.split(key, 4)
+    reference = lookup(assets.library, clip, frame)
+    if env.noisy:
+        parameters = randomise.physics_parameters(noise, keys[1], n)
+        encoder_bias = randomise.symmetric(keys[2], n, (noise.encoder_bias,) * joints)
+    else:
+        parameters = randomise.nominal_parameters(env.nominal_friction, n)
+        encoder_bias = jnp.zeros((n, joints))
+    return EnvState(
+        physics=randomise.reset_state(noise, assets.robot, reference, env.robot.root, keys[0]),
+        bodies=BodyState(
+            pos=reference.body_pos,
+            quat=reference.body_quat,
+            lin_vel=reference.body_lin_vel,
+            ang_vel=reference.body_ang_vel,
+            contact_force=jnp.zeros_like(reference.body_pos),
+        ),
+        parameters=parameters,
+        clip=clip,
+        frame=frame,
+        start_bin=start_bin,
+        step=jnp.zeros((n,), jnp.int32),
+        horizon=jnp.minimum(env.config.max_episode_steps, assets.library.length[clip] - 1 - frame),
+        tracking_sum=jnp.zeros((n,), jnp.float32),
+        last_action=jnp.zeros((n, joints), jnp.float32),
+        encoder_bias=encoder_bias,
+        wrench_gain=wrench_gain,
+        push_countdown=randomise.push_interval(noise, keys[3], n, env.control_step),
+        terms=jnp.ones((n, len(reward.tracking_weights(env.config.reward))), jnp.float32),
+    )
+
+
+def refresh_bodies(env: Environment, state: EnvState, mask: Array) -> EnvState:
+    """Key bodies by forward kinematics where mask [env]: a reset's noise moved them off the reference."""
+    return state.replace(bodies=env.engine.forward(state.physics, state.parameters, mask, state.bodies))
+
+
+def reset_where(
+    env: Environment, assets: Assets, state: EnvState, mask: Array, key: Array, probabilities: Array, gains: Array
+) -> EnvState:
+    """New episodes where mask [env], drawn from `probabilities` [clip, bin] with wrench gains [clip, bin]."""
+    start_key, episode_key = jax.random.split(key)
+    clip, start_bin, frame = sample_start(start_key, probabilities, assets.bins, env.num_envs)
+    fresh = start_episodes(env, assets, episode_key, clip, start_bin, frame, gains[clip, start_bin])
+    return refresh_bodies(env, _where(mask, fresh, state), mask)
+
+
+def assist(env: Environment, assets: Assets, state: EnvState) -> Array:
+    """The assistive wrench [env, 6] N, N m: β times the reference wrench towards the current frame."""
+    reference = lookup(assets.library, state.clip, state.frame)
+    wrench = reference_wrench(env.config.wrench, assets.robot, reference, state.bodies, env.robot.anchor)
+    return state.wrench_gain[:, None] * wrench
+
+
+def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: Array) -> tuple[EnvState, StepResult]:
+    """One control step of every environment, without resets.
+
+    Args:
+        env: static part.
+        assets: constant arrays.
+        state: before the step.
+        action: [env, joint]; the PD target is q_ref(t + 1) + action_scale · action.
+        key: for pushes.
+    """
+    config, robot = env.config, env.robot
+    reference = lookup(assets.library, state.clip, state.frame + 1)
+    # The joint controller regulates what its encoders read, so their bias moves the robot, not the reading.
+    target = reference.joint_pos + assets.robot.action_scale * action - state.encoder_bias
+    wrench = assist(env, assets, state) if config.wrench.max_gain > 0 else jnp.zeros((env.num_envs, 6), jnp.float32)
+
+    physics, countdown = state.physics, state.push_countdown
+    if env.noisy:
+        push_key, interval_key = jax.random.split(key)
+        due = countdown <= 0
+        pushed = randomise.push(config.noise, push_key, physics.qvel)
+        physics = physics.replace(qvel=jnp.where(due[:, None], pushed, physics.qvel))
+        interval = randomise.push_interval(config.noise, interval_key, env.num_envs, env.control_step)
+        countdown = jnp.where(due, interval, countdown - 1)
+
+    physics, bodies = env.engine.step(physics, state.parameters, target, wrench)
+    diverged = ~_all_finite((physics, bodies), env.num_envs)
+    # A diverged robot shows as standing where it was, so that no NaN can reach a sum; it is reset right after.
+    physics, bodies = (_where(diverged, old, new) for old, new in ((state.physics, physics), (state.bodies, bodies)))
+
+    joint_pos, joint_vel = physics.qpos[:, 7:], physics.qvel[:, 6:]
+    aligned = align_to_anchor(reference, robot.anchor, bodies.pos[:, robot.anchor], bodies.quat[:, robot.anchor])
+    errors = reward.tracking_errors(reference, aligned, bodies, robot.anchor, joint_pos, joint_vel)
+    tracking, normalized, terms = reward.tracking_reward(errors, config.reward)
+    regularisation = reward.regularisation_reward(
+        assets.robot,
+        config.reward,
+        action=action,
+        last_action=state.last_action,
+        joint_pos=joint_pos,
+        joint_vel=joint_vel,
+        joint_acc=physics.warmstart[:, 6:],
+        target=target,
+    )
+    alive = ~diverged
+    result_reward = reward.Reward(
+        tracking=tracking * alive,
+        regularisation=regularisation * alive,
+        normalized_tracking=normalized * alive,
+        terms={name: term * alive for name, term in terms.items()},
+    )
+    causes = terminations(config.termination, reference, aligned, bodies, robot.anchor, jnp.asarray(robot.end_effectors))
+    terminated = diverged | jnp.stack(list(causes.values())).any(0)
+    steps = state.step + 1
+    new = state.replace(
+        physics=physics,
+        bodies=bodies,
+        frame=state.frame + 1,
+        step=steps,
+        tracking_sum=state.tracking_sum + result_reward.normalized_tracking,
+        last_action=action,
+        push_countdown=countdown,
+        terms=jnp.stack(list(terms.values()), axis=-1),
+    )
+    truncated = (steps >= state.horizon) & ~terminated
+    return new, StepResult(result_reward, terminated, truncated, diverged, causes, reference)
+
+
+def observe(env: Environment, assets: Assets, state: EnvState, key: Array | None) -> tuple[Array, Array]:
+    """Actor observation [env, 16 + 4 joint] and critic observation [env, features]; noise on the actor's with a key."""
+    robot = env.robot
+    reference = lookup(assets.library, state.clip, state.frame + 1)
+    clean = observation.actor_observation(
+        assets.robot, reference, robot.root, state.physics, state.last_action
+    )
+    wrench = assist(env, assets, state) if env.config.wrench.max_gain > 0 else jnp.zeros((env.num_envs, 6), jnp.float32)
+    critic = observation.critic_observation(
+        clean,
+        reference,
+        state.bodies,
+        robot.anchor,
+        robot.root,
+        wrench=wrench / (assets.robot.mass * 9.81),
+        wrench_gain=state.wrench_gain,
+        phase=state.frame / assets.library.length[state.clip],
+        terms=state.terms,
+    )
+    if key is None:
+        return clean, critic
+    joints = robot.num_joints
+    noise = observation.observation_noise(env.config.noise, key, env.num_envs, joints)
+    bias = jnp.pad(state.encoder_bias, ((0, 0), (16 + joints, 2 * joints)))
+    return clean + noise + bias, critic
+
+
+def _all_finite(tree, num_envs: int) -> Array:
+    """bool[env]: every number of the environment is finite."""
+    return jnp.stack([jnp.isfinite(leaf).reshape(num_envs, -1).all(-1) for leaf in jax.tree.leaves(tree)]).all(0)
+
+
+def _where(mask: Array, on_true, on_false):
+    return jax.tree.map(lambda a, b: jnp.where(mask.reshape(-1, *[1] * (a.ndim - 1)), a, b), on_true, on_false)

@@ -1,0 +1,69 @@
+"""The reference frame an environment tracks, and the reference moved to the robot's anchor."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from flax import struct
+from jax import Array
+
+from forgetmimic_jax import rotation
+from forgetmimic_jax.motion.library import MotionLibrary
+
+
+@struct.dataclass
+class Reference:
+    """One frame of a clip for every environment; world frame."""
+
+    joint_pos: Array  # [env, joint] rad
+    joint_vel: Array  # [env, joint] rad/s
+    body_pos: Array  # [env, key_body, 3] m
+    body_quat: Array  # [env, key_body, 4]
+    body_lin_vel: Array  # [env, key_body, 3] m/s
+    body_ang_vel: Array  # [env, key_body, 3] rad/s
+    anchor_lin_acc: Array  # [env, 3] m/s²
+    anchor_ang_acc: Array  # [env, 3] rad/s²
+
+
+def lookup(library: MotionLibrary, clip: Array, frame: Array) -> Reference:
+    """Frame `frame` [env] of clip `clip` [env]; past a clip's end its last frame."""
+    frame = jnp.minimum(frame, library.length[clip] - 1)
+    return Reference(
+        joint_pos=library.joint_pos[clip, frame],
+        joint_vel=library.joint_vel[clip, frame],
+        body_pos=library.body_pos[clip, frame],
+        body_quat=library.body_quat[clip, frame],
+        body_lin_vel=library.body_lin_vel[clip, frame],
+        body_ang_vel=library.body_ang_vel[clip, frame],
+        anchor_lin_acc=library.anchor_lin_acc[clip, frame],
+        anchor_ang_acc=library.anchor_ang_acc[clip, frame],
+    )
+
+
+@struct.dataclass
+class AlignedBodies:
+    """Key bodies of the reference after moving it to the robot's anchor in x, y and yaw (height stays)."""
+
+    pos: Array  # [env, key_body, 3]
+    quat: Array  # [env, key_body, 4]
+    lin_vel: Array  # [env, key_body, 3]
+    ang_vel: Array  # [env, key_body, 3]
+
+
+def align_to_anchor(reference: Reference, anchor: int, anchor_pos: Array, anchor_quat: Array) -> AlignedBodies:
+    """Move the reference so that its anchor has the robot's x, y and yaw.
+
+    Args:
+        reference: the frame tracked.
+        anchor: index of the anchor among the key bodies.
+        anchor_pos: [env, 3] the robot's anchor.
+        anchor_quat: [env, 4].
+    """
+    ref_pos, ref_quat = reference.body_pos[:, anchor], reference.body_quat[:, anchor]
+    turn = rotation.yaw_only(rotation.multiply(anchor_quat, rotation.conjugate(ref_quat)))[:, None]
+    origin = jnp.concatenate([anchor_pos[:, :2], ref_pos[:, 2:]], axis=-1)[:, None]
+    return AlignedBodies(
+        pos=origin + rotation.rotate(turn, reference.body_pos - ref_pos[:, None]),
+        quat=rotation.multiply(turn, reference.body_quat),
+        lin_vel=rotation.rotate(turn, reference.body_lin_vel),
+        ang_vel=rotation.rotate(turn, reference.body_ang_vel),
+    )

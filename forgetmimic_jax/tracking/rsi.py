@@ -1,0 +1,117 @@
+"""Reference-state initialisation: which clip and frame an episode starts from (paper, 'Standard RSI').
+
+Every sampler is a distribution over (clip, bin) with the frame uniform inside the bin.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from forgetmimic_jax.config import SamplingConfig
+from forgetmimic_jax.motion.library import MotionLibrary
+
+
+@struct.dataclass
+class Bins:
+    """Temporal bins of every clip. An episode may start at frames start ≤ frame < end of a valid bin."""
+
+    start: Array  # i32[clip, bin]
+    end: Array  # i32[clip, bin]
+    valid: Array  # bool[clip, bin]
+
+
+def make_bins(library: MotionLibrary, bin_seconds: float, control_step: float) -> Bins:
+    """Bins of `bin_seconds`; valid if at least half of its width is covered, and every clip has at least one.
+
+    The last valid bin takes what is left of the clip. The last frame of a clip is never a start: no step follows it.
+    """
+    width = max(1, round(bin_seconds / control_step))
+    starts = np.asarray(library.length) - 1
+    count = max(1, -(-int(starts.max()) // width))
+    start = np.tile(np.arange(count) * width, (len(starts), 1))
+    covered = np.clip(starts[:, None] - start, 0, width)
+    valid = covered >= width / 2
+    valid[:, 0] = True
+    last = valid.sum(1) - 1
+    end = np.minimum(start + width, starts[:, None])
+    end[np.arange(len(starts)), last] = starts
+    return Bins(
+        start=jnp.asarray(np.where(valid, start, 0), jnp.int32),
+        end=jnp.asarray(np.where(valid, end, 1), jnp.int32),
+        valid=jnp.asarray(valid),
+    )
+
+
+def bin_probabilities(config: SamplingConfig, bins: Bins, failure_level: Array) -> Array:
+    """p [clip, bin] of starting in each bin.
+
+    adaptive and frozen: p = (1 − ρ) softmax(L/τ) + ρ/N_valid with τ = 1/ln(1 + N_valid); frozen differs only in that
+    L is no longer updated. uniform_bins: 1/N_valid. uniform_clips: a clip uniformly, then a frame uniformly.
+    """
+    count = bins.valid.sum()
+    if config.rule == "uniform_clips":
+        frames = jnp.where(bins.valid, bins.end - bins.start, 0)
+        return frames / frames.sum(-1, keepdims=True) / frames.shape[0]
+    uniform = bins.valid / count
+    if config.rule == "uniform_bins":
+        return uniform
+    temperature = 1.0 / jnp.log1p(count)
+    logits = jnp.where(bins.valid, failure_level / temperature, -jnp.inf)
+    softmax = jax.nn.softmax(logits.reshape(-1)).reshape(logits.shape)
+    return (1.0 - config.uniform_ratio) * softmax + config.uniform_ratio * uniform
+
+
+def sample_start(key: Array, probabilities: Array, bins: Bins, num: int) -> tuple[Array, Array, Array]:
+    """Clip, bin and frame, each i32[num]."""
+    bin_key, frame_key = jax.random.split(key)
+    flat = jax.random.categorical(bin_key, jnp.log(probabilities.reshape(-1)), shape=(num,))
+    clip, index = jnp.divmod(flat, probabilities.shape[1])
+    frame = jax.random.randint(frame_key, (num,), bins.start[clip, index], bins.end[clip, index])
+    return clip.astype(jnp.int32), index.astype(jnp.int32), frame.astype(jnp.int32)
+
+
+def episode_failure(config: SamplingConfig, tracking_sum: Array, steps: Array, horizon: Array) -> Array:
+    """f_episode [...] in [0, 1] of ended episodes.
+
+    survival_weighted: 1 − clamp(Σ_t r̄_t / horizon), so an early death counts as failure. alive_mean: the paper's
+    literal mean over the steps alive.
+
+    Args:
+        config: which signal.
+        tracking_sum: Σ_t r̄_t over the episode.
+        steps: steps lived.
+        horizon: steps the episode could have lived, min(500, frames left).
+    """
+    divisor = horizon if config.failure_signal == "survival_weighted" else steps
+    return 1.0 - jnp.clip(tracking_sum / jnp.maximum(divisor, 1), 0.0, 1.0)
+
+
+def update_failure_level(
+    config: SamplingConfig, failure_level: Array, done: Array, failure: Array, clip: Array, index: Array
+) -> Array:
+    """L [clip, bin] after a batch of ended episodes, each credited to its start bin.
+
+    The paper's EMA is per episode. k episodes of mean f̄ give L ← (1−α)^k L + (1 − (1−α)^k) f̄, so the time constant
+    in episodes does not depend on how many end at once.
+
+    Args:
+        config: smoothing α, and the rule: only `adaptive` learns.
+        failure_level: L before.
+        done: bool[...] where an episode ended.
+        failure: f_episode[...].
+        clip: i32[...] the episode's clip.
+        index: i32[...] its start bin.
+    """
+    if config.rule == "frozen":
+        return failure_level
+    num_bins = failure_level.shape[1]
+    flat = (clip * num_bins + index).reshape(-1)
+    ended = done.reshape(-1).astype(jnp.float32)
+    count = jax.ops.segment_sum(ended, flat, failure_level.size).reshape(failure_level.shape)
+    total = jax.ops.segment_sum(ended * failure.reshape(-1), flat, failure_level.size).reshape(failure_level.shape)
+    keep = (1.0 - config.smoothing) ** count
+    return keep * failure_level + (1.0 - keep) * total / jnp.maximum(count, 1.0)

@@ -1,0 +1,45 @@
+"""The assistive wrench: a computed-torque pull of the anchor towards the reference (paper, 'Standard AW')."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import Array
+
+from forgetmimic_jax import rotation
+from forgetmimic_jax.config import WrenchConfig
+from forgetmimic_jax.physics import BodyState
+from forgetmimic_jax.robot import RobotArrays
+from forgetmimic_jax.tracking.reference import Reference
+
+
+def wrench_gain(config: WrenchConfig, failure_level: Array) -> Array:
+    """β = clamp(1 − (1 − L)/η, 0, β_max), of any shape."""
+    return jnp.clip(1.0 - (1.0 - failure_level) / config.sensitivity, 0.0, config.max_gain)
+
+
+def reference_wrench(
+    config: WrenchConfig, robot: RobotArrays, reference: Reference, bodies: BodyState, anchor: int
+) -> Array:
+    """Force and torque [env, 6] (N, N m; world frame) that would carry the anchor along the reference.
+
+    F = M (a_ref + k_p e_p + k_d e_v − g); τ = I_w (α_ref + k_R e_R + k_ω e_ω) + ω × I_w ω, with I_w the robot's
+    inertia turned to the world by the anchor. `law="wbc"` leaves M and I_w off the gain and gravity terms, as
+    wbc-mjlab's code does.
+    """
+    quat, ang_vel = bodies.quat[:, anchor], bodies.ang_vel[:, anchor]
+    position_pull = config.position_stiffness * (reference.body_pos[:, anchor] - bodies.pos[:, anchor])
+    position_pull += config.position_damping * (reference.body_lin_vel[:, anchor] - bodies.lin_vel[:, anchor])
+    orientation_pull = config.orientation_stiffness * rotation.difference(reference.body_quat[:, anchor], quat)
+    orientation_pull += config.orientation_damping * (reference.body_ang_vel[:, anchor] - ang_vel)
+
+    def inertia(vector: Array) -> Array:
+        return rotation.rotate(quat, rotation.rotate_inverse(quat, vector) @ robot.inertia.T)
+
+    gyroscopic = jnp.cross(ang_vel, inertia(ang_vel))
+    if config.law == "wbc":
+        force = robot.mass * reference.anchor_lin_acc + position_pull - robot.gravity
+        torque = inertia(reference.anchor_ang_acc) + orientation_pull + gyroscopic
+    else:
+        force = robot.mass * (reference.anchor_lin_acc + position_pull - robot.gravity)
+        torque = inertia(reference.anchor_ang_acc + orientation_pull) + gyroscopic
+    return jnp.concatenate([force, torque], axis=-1)
