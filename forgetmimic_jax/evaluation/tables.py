@@ -95,15 +95,22 @@ def fill(text: str, directory: Path) -> str:
     return BLOCK.sub(tables, text)
 
 
-def _ordered(document: Mapping[str, Any]) -> list[str]:
+def policy_order(document: Mapping[str, Any]) -> list[str]:
+    """The policies of a document in the order that tables and figures show them."""
     policies = document["policies"]
     known = [policy for policy in POLICY_ORDER if policy in policies]
     return known + [policy for policy in policies if policy not in POLICY_ORDER]
 
 
+def clip_order(document: Mapping[str, Any]) -> list[str]:
+    """The clips of a document, targets first."""
+    clips = next(iter(document["policies"].values()))["clips"]
+    return sorted(clips, key=lambda name: (not clips[name]["target"], name))
+
+
 def _subject(document: Mapping[str, Any]) -> str | None:
     """The policy that is compared with the base: the unlearned one, or the first other that was trained."""
-    return next((policy for policy in _ordered(document) if policy not in (BASE, ZERO_ACTION)), None)
+    return next((policy for policy in policy_order(document) if policy not in (BASE, ZERO_ACTION)), None)
 
 
 def _clip_rows(document: Mapping[str, Any], *, digits: int = 3, interval: bool = True) -> _Rows:
@@ -115,7 +122,7 @@ def _clip_rows(document: Mapping[str, Any], *, digits: int = 3, interval: bool =
     header += ["floor"] * (ZERO_ACTION in policies) + ["left", "result"] * (len(shown) == 2)
     rows = []
     clips = policies[shown[0]]["clips"]
-    for clip in sorted(clips, key=lambda name: (not clips[name]["target"], name)):
+    for clip in clip_order(document):
         role = "target" if clips[clip]["target"] else "kept"
         of = {policy: policies[policy]["clips"][clip] for policy in policies}
         success = [_percent(of[policy]["success_rate"], interval=interval) for policy in shown]
@@ -140,7 +147,7 @@ def _verdict(left: Estimate | None, role: str) -> str:
 
 def _group_rows(document: Mapping[str, Any], *, digits: int = 3) -> _Rows:
     """Targets and kept clips of every policy, with intervals."""
-    policies, order = document["policies"], _ordered(document)
+    policies, order = document["policies"], policy_order(document)
     rows = []
     for group in ("target", "kept"):
         if not any(group in policies[policy] for policy in order):
@@ -167,7 +174,7 @@ def _group_rows(document: Mapping[str, Any], *, digits: int = 3) -> _Rows:
 
 def _error_rows(document: Mapping[str, Any]) -> _Rows:
     """Tracking errors and physical measures of every policy by group, over steps alive and over common steps."""
-    policies, order = document["policies"], _ordered(document)
+    policies, order = document["policies"], policy_order(document)
     rows = []
     for group in ("target", "kept"):
         metrics = policies[order[0]].get(group, {})

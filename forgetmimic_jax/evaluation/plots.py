@@ -1,0 +1,84 @@
+"""Figures that read evaluation.json and metrics.jsonl. matplotlib is loaded only when a figure is drawn."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.evaluation.tables import clip_order, policy_order
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+STEPS = ("iteration", "environment_steps")
+
+
+def clip_bars(
+    document: Mapping[str, Any], path: Path, *, metrics: Sequence[str] = ("success_rate", "survival_weighted_tracking")
+) -> None:
+    """Bars of every policy clip by clip, with 95 % intervals, targets first and shaded; a PNG."""
+    policies, clips = policy_order(document), clip_order(document)
+    targets = sum(document["policies"][policies[0]]["clips"][clip]["target"] for clip in clips)
+    figure = _figure(width=2.0 + 0.7 * len(clips), height=3.0 * len(metrics))
+    width = 0.8 / len(policies)
+    for row, metric in enumerate(metrics):
+        axes = figure.add_subplot(len(metrics), 1, row + 1)
+        axes.axvspan(-0.5, targets - 0.5, color="0.92")
+        for offset, policy in enumerate(policies):
+            estimates = [document["policies"][policy]["clips"][clip].get(metric, {}) for clip in clips]
+            means = [estimate.get("mean", 0.0) for estimate in estimates]
+            # Rounding may put the ends of a zero-width interval on the wrong side of the mean.
+            pairs = list(zip(means, estimates, strict=True))
+            below = [max(0.0, mean - estimate.get("low", mean)) for mean, estimate in pairs]
+            above = [max(0.0, estimate.get("high", mean) - mean) for mean, estimate in pairs]
+            positions = [clip + (offset - 0.5 * (len(policies) - 1)) * width for clip in range(len(clips))]
+            axes.bar(positions, means, width, yerr=[below, above], capsize=2, label=policy.replace("_", " "))
+        axes.set_ylabel(metric.replace("_", " "))
+        axes.set_xlim(-0.5, len(clips) - 0.5)
+        axes.set_xticks(range(len(clips)), clips, rotation=30, ha="right")
+    figure.axes[0].legend(ncols=min(4, len(policies)), loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
+    _save(figure, path)
+
+
+def training_curves(metrics_file: Path, path: Path, *, keys: Sequence[str] | None = None) -> None:
+    """One panel a key of a metrics.jsonl over environment steps; a PNG.
+
+    Args:
+        metrics_file: one JSON object a line with iteration, environment_steps and numbers.
+        path: PNG to write.
+        keys: which numbers to draw; all that are there by default.
+
+    Raises:
+        InputError: no line to draw, or a key that no line has.
+    """
+    lines = [json.loads(line) for line in metrics_file.read_text().splitlines() if line.strip()]
+    present = sorted({key for line in lines for key, value in line.items() if isinstance(value, int | float)})
+    keys = [key for key in present if key not in STEPS] if keys is None else keys
+    missing = [key for key in keys if key not in present]
+    if not keys or missing:
+        raise InputError(f"{metrics_file}: nothing to draw: no {', '.join(missing) or 'numbers'} in its lines")
+    columns = min(4, len(keys))
+    rows = -(-len(keys) // columns)
+    figure = _figure(width=3.5 * columns, height=2.3 * rows)
+    for panel, key in enumerate(keys):
+        axes = figure.add_subplot(rows, columns, panel + 1)
+        points = [(line["environment_steps"], line[key]) for line in lines if key in line]
+        axes.plot(*zip(*points, strict=True))
+        axes.set_title(key.replace("_", " "), fontsize="small")
+        axes.set_xlabel("environment steps", fontsize="small")
+    _save(figure, path)
+
+
+def _figure(*, width: float, height: float) -> Figure:
+    from matplotlib.figure import Figure
+
+    # A Figure without pyplot needs no display and leaves no global state; its canvas is Agg.
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def _save(figure: Figure, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=150)
