@@ -1,0 +1,88 @@
+# Every command of the README. The first one makes .venv (once, a few minutes); after that each starts at once.
+# Works with GNU make 3.81 (macOS) and later.
+
+# Variables: `make TARGET VARIABLE=value`. A command gets those that are set and keeps its own default for the others.
+## ROBOT        a folder under robots/ (default: g1)
+## TARGETS      clips to forget, comma-separated: punch,kick
+## LAMBDA       penalty on the targets' tracking reward (default: 16)
+## PRESET       cpu or paper (default: by what this machine has)
+## PHYSICS      auto, native, mjx or mjx-warp (default: auto)
+## ITERATIONS   training iterations
+## SEED         random seed
+## CHECKPOINT   the policy to evaluate or to start from
+## EPISODES     episodes a clip in an evaluation (default: 20)
+## OUTPUT       folder for the results (default: a new one under runs/)
+## RESUME       1 goes on with the run in OUTPUT
+## ARGS         any other flags, as they are; ARGS=--help lists them
+## PYTHON       the Python that .venv is made from, 3.11 to 3.13 (default: the first found)
+ROBOT ?= g1
+
+MODULE = .venv/bin/python -m forgetmimic_jax
+RUN_FLAGS = --robot $(ROBOT) \
+	$(if $(PRESET),--preset $(PRESET)) \
+	$(if $(PHYSICS),--physics $(PHYSICS)) \
+	$(if $(SEED),--seed $(SEED)) \
+	$(if $(OUTPUT),--output $(OUTPUT))
+TRAIN_FLAGS = $(RUN_FLAGS) \
+	$(if $(ITERATIONS),--iterations $(ITERATIONS)) \
+	$(if $(RESUME),--resume)
+TARGET_FLAGS = $(if $(TARGETS),--targets $(TARGETS))
+POLICY_FLAGS = $(if $(CHECKPOINT),--checkpoint $(CHECKPOINT)) $(if $(EPISODES),--episodes $(EPISODES))
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help unlearn pretrain evaluate motions bench tables test lint format clean
+
+help: ## this list
+	@echo 'make TARGET [VARIABLE=value ...]'
+	@echo
+	@sed -n 's/^\([a-z]*\):.*## \(.*\)/\1|\2/p' Makefile | \
+		while IFS='|' read -r name text; do printf '  %-12s %s\n' "$$name" "$$text"; done
+	@echo
+	@sed -n 's/^## /  /p' Makefile
+
+unlearn: .venv/.installed ## forget TARGETS, then evaluate base and unlearned policy side by side
+	$(MODULE).unlearn $(strip $(TRAIN_FLAGS) $(TARGET_FLAGS) $(if $(LAMBDA),--penalty $(LAMBDA)) $(POLICY_FLAGS) $(ARGS))
+
+pretrain: .venv/.installed ## train a base policy on every clip
+	$(MODULE).train $(strip $(TRAIN_FLAGS) $(ARGS))
+
+evaluate: .venv/.installed ## evaluate CHECKPOINT clip by clip
+	$(MODULE).evaluate $(strip $(RUN_FLAGS) $(TARGET_FLAGS) $(POLICY_FLAGS) $(ARGS))
+
+motions: .venv/.installed ## make a library from your own clips (ARGS=--help says how)
+	$(MODULE).motions $(strip --robot $(ROBOT) $(ARGS))
+
+bench: .venv/.installed ## steps per second of training on this machine
+	$(MODULE).bench $(strip $(RUN_FLAGS) $(ARGS))
+
+tables: .venv/.installed ## rewrite the README's tables from the evaluation files they name
+	$(MODULE).evaluation.tables README.md
+
+test: .venv/.installed ## run the tests
+	.venv/bin/python -m pytest $(ARGS)
+
+lint: .venv/.installed ## check style, formatting and types
+	.venv/bin/ruff check .
+	.venv/bin/ruff format --check .
+	.venv/bin/mypy forgetmimic_jax
+
+format: .venv/.installed ## put the code in its format
+	.venv/bin/ruff check --fix .
+	.venv/bin/ruff format .
+
+clean: ## remove caches and build leftovers; runs/ and .venv stay
+	rm -rf .pytest_cache .ruff_cache .mypy_cache build *.egg-info
+	find forgetmimic_jax tests experiments -name __pycache__ -prune -exec rm -rf {} +
+
+.venv/.installed: requirements.lock pyproject.toml
+	@for python in $(if $(PYTHON),$(PYTHON),python3 python3.13 python3.12 python3.11); do \
+		if $$python -c 'import sys, ensurepip; sys.exit(not (3, 11) <= sys.version_info < (3, 14))' 2>/dev/null; then \
+			echo "making .venv with $$($$python --version) (once, a few minutes)"; \
+			exec $$python -m venv .venv; \
+		fi; \
+	done; \
+	echo 'error: needs Python 3.11, 3.12 or 3.13 with its venv module; name one with PYTHON=/path/to/python' >&2; exit 2
+	.venv/bin/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
+	.venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
+	@touch $@
