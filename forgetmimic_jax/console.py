@@ -1,0 +1,92 @@
+"""What a long command says while it works and when it ends."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+Report = Callable[[int, int, Mapping[str, float]], None]
+
+
+@contextmanager
+def progress(
+    description: str,
+    total_iterations: int,
+    *,
+    start: int = 0,
+    every_seconds: float = 30.0,
+    console: Console | None = None,
+) -> Iterator[Report]:
+    """A progress bar with time left, environment steps per second and live metrics; plain lines without a terminal.
+
+    Args:
+        description: what is being done.
+        total_iterations: where it ends.
+        start: iterations already done, on a resume.
+        every_seconds: between two plain lines.
+        console: where to write; the standard output by default.
+
+    Yields:
+        report(iterations done, environment steps done, metrics to show), to be called after each iteration. Time before
+        the first report is not counted: it is compilation.
+    """
+    console = console or Console()
+    clock = _Clock()
+    if console.is_terminal:
+        columns = (TextColumn("{task.description}"), BarColumn(bar_width=20), MofNCompleteColumn())
+        times = (TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(compact=True))
+        with Progress(*columns, *times, TextColumn("{task.fields[live]}"), console=console) as bar:
+            task = bar.add_task(description, total=total_iterations, completed=start, live="compiling")
+            yield lambda done, steps, metrics: bar.update(
+                task, completed=done, live=_live(clock.rates(done, steps)[1], metrics)
+            )
+        return
+
+    last_line = time.monotonic()
+
+    def report(done: int, steps: int, metrics: Mapping[str, float]) -> None:
+        nonlocal last_line
+        iteration_rate, step_rate = clock.rates(done, steps)
+        if done >= total_iterations or time.monotonic() - last_line >= every_seconds:
+            last_line = time.monotonic()
+            left = f"{(total_iterations - done) / iteration_rate / 60:.0f} min left  " if iteration_rate else ""
+            _plain(console, f"{description}: {done}/{total_iterations}  {left}{_live(step_rate, metrics)}")
+
+    _plain(console, f"{description}: {start}/{total_iterations}")
+    yield report
+
+
+def closing(files: Mapping[str, Path], next_command: str, *, console: Console | None = None) -> None:
+    """Where the results went (what they are: path), and what to try next."""
+    console = console or Console()
+    width = max((len(what) for what in files), default=0)
+    lines = [f"{what:<{width}}  {path}" for what, path in files.items()]
+    _plain(console, "\n".join(["", *lines, "", f"Next: {next_command}"]))
+
+
+@dataclass
+class _Clock:
+    """Iterations and environment steps per second since the first report."""
+
+    first: tuple[float, int, int] | None = None
+
+    def rates(self, done: int, steps: int) -> tuple[float, float]:
+        now = time.monotonic()
+        self.first = self.first or (now, done, steps)
+        seconds = max(now - self.first[0], 1e-9)
+        return (done - self.first[1]) / seconds, (steps - self.first[2]) / seconds
+
+
+def _live(step_rate: float, metrics: Mapping[str, float]) -> str:
+    rate = [f"{step_rate:,.0f} steps/s"] if step_rate else []
+    return "  ".join([*rate, *(f"{name.replace('_', ' ')} {value:.3g}" for name, value in metrics.items())])
+
+
+def _plain(console: Console, text: str) -> None:
+    console.print(text, highlight=False, markup=False, soft_wrap=True)
