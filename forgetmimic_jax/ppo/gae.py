@@ -1,0 +1,33 @@
+"""Generalised advantage estimation with truncation."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+
+def generalized_advantages(
+    reward: Array, value: Array, next_value: Array, terminated: Array, truncated: Array, discount: float, gae_lambda: float
+) -> tuple[Array, Array]:
+    """Advantages and value targets, each [time, env] (Schulman et al. 2016, equation 16).
+
+    Args:
+        reward: [time, env].
+        value: [time, env] V(s_t).
+        next_value: [time, env] V of the state that followed s_t before any reset.
+        terminated: [time, env] no value follows.
+        truncated: [time, env] the episode ends here but the value of its last state follows.
+        discount: γ.
+        gae_lambda: λ.
+    """
+    delta = reward + discount * next_value * (1.0 - terminated) - value
+    carry_on = 1.0 - jnp.maximum(terminated, truncated).astype(reward.dtype)
+
+    def backward(advantage: Array, inputs: tuple[Array, Array]) -> tuple[Array, Array]:
+        delta, carry_on = inputs
+        advantage = delta + discount * gae_lambda * carry_on * advantage
+        return advantage, advantage
+
+    _, advantage = jax.lax.scan(backward, jnp.zeros_like(delta[0]), (delta, carry_on), reverse=True)
+    return advantage, advantage + value

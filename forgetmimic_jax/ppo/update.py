@@ -1,0 +1,241 @@
+"""One PPO iteration: collect, advantages, epochs, sampler. A pure function of the TrainState, jitted once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jax import Array
+
+from forgetmimic_jax.config import PPOConfig
+from forgetmimic_jax.ppo.gae import generalized_advantages
+from forgetmimic_jax.ppo.loss import adapt_learning_rate, policy_loss, value_loss
+from forgetmimic_jax.ppo.network import entropy, kl_divergence, log_prob, normalize, update_normalizer
+from forgetmimic_jax.state import Policy, TrainState, make_actor, make_critic, make_optimizer
+from forgetmimic_jax.tracking import env as tracking
+from forgetmimic_jax.tracking.env import Assets, Environment
+from forgetmimic_jax.tracking.rsi import bin_probabilities, episode_failure, update_failure_level
+from forgetmimic_jax.tracking.wrench import wrench_gain
+from forgetmimic_jax.unlearning.antireward import training_reward
+
+
+@struct.dataclass
+class Trajectory:
+    """A rollout. Leading dimensions: time, env."""
+
+    actor_observation: Array
+    critic_observation: Array
+    action: Array
+    log_prob: Array
+    mean: Array
+    value: Array
+    next_value: Array  # V of the state reached, before any reset
+    reward: Array  # R' × control step
+    tracking: Array  # R_track
+    regularisation: Array  # R_reg
+    normalized_tracking: Array  # r̄
+    terminated: Array
+    truncated: Array
+    diverged: Array
+    clip: Array
+    start_bin: Array
+    failure: Array  # f_episode, meaningful where the episode ended
+    steps: Array  # steps lived, meaningful where the episode ended
+    wrench_gain: Array
+    causes: dict[str, Array]
+
+
+Metrics = dict[str, Array]
+
+
+def make_iteration(env: Environment) -> Callable[[Assets, TrainState], tuple[TrainState, Metrics]]:
+    """The jitted iteration(assets, state) → (state, metrics); the state is donated."""
+
+    def iteration(assets: Assets, state: TrainState) -> tuple[TrainState, Metrics]:
+        state, trajectory = collect(env, assets, state)
+        advantage, target = generalized_advantages(
+            trajectory.reward,
+            trajectory.value,
+            trajectory.next_value,
+            trajectory.terminated,
+            trajectory.truncated,
+            env.config.ppo.discount,
+            env.config.ppo.gae_lambda,
+        )
+        state, losses = improve(env, state, trajectory, advantage, target)
+        return learn_sampler(env, assets, state, trajectory, losses)
+
+    return jax.jit(iteration, donate_argnums=1)
+
+
+def collect(env: Environment, assets: Assets, state: TrainState) -> tuple[TrainState, Trajectory]:
+    """`num_steps` control steps of every environment with the current policy."""
+    config, policy = env.config, state.policy
+    actor, critic = make_actor(config, env.robot.num_joints), make_critic(config)
+    probabilities = bin_probabilities(config.sampling, assets.bins, state.failure_level)
+    gains = wrench_gain(config.wrench, state.failure_level)
+
+    def value_of(observation: Array) -> Array:
+        return critic.apply(policy.critic, normalize(policy.critic_normalizer, observation))
+
+    def one_step(carry, key: Array):
+        before, actor_obs, critic_obs = carry
+        action_key, step_key, reset_key, observe_key = jax.random.split(key, 4)
+        mean, log_std = actor.apply(policy.actor, normalize(policy.actor_normalizer, actor_obs))
+        action = mean + jnp.exp(log_std) * jax.random.normal(action_key, mean.shape)
+        after, result = tracking.step(env, assets, before, action, step_key)
+        done = result.terminated | result.truncated
+        fresh = tracking.reset_where(env, assets, after, done, reset_key, probabilities, gains)
+        next_actor_obs, next_critic_obs = tracking.observe(env, assets, fresh, observe_key if env.noisy else None)
+        last_critic_obs = tracking.observe(env, assets, after, None)[1]
+        trajectory = Trajectory(
+            actor_observation=actor_obs,
+            critic_observation=critic_obs,
+            action=action,
+            log_prob=log_prob(action, mean, log_std),
+            mean=mean,
+            value=value_of(critic_obs),
+            next_value=value_of(last_critic_obs),
+            reward=training_reward(config, result.reward, assets.is_target[before.clip]) * env.control_step,
+            tracking=result.reward.tracking,
+            regularisation=result.reward.regularisation,
+            normalized_tracking=result.reward.normalized_tracking,
+            terminated=result.terminated,
+            truncated=result.truncated,
+            diverged=result.diverged,
+            clip=before.clip,
+            start_bin=before.start_bin,
+            failure=episode_failure(config.sampling, after.tracking_sum, after.step, after.horizon),
+            steps=after.step,
+            wrench_gain=before.wrench_gain,
+            causes=result.causes,
+        )
+        return (fresh, next_actor_obs, next_critic_obs), trajectory
+
+    key, first_key, rollout_key = jax.random.split(state.key, 3)
+    first = tracking.observe(env, assets, state.env, first_key if env.noisy else None)
+    keys = jax.random.split(rollout_key, config.ppo.num_steps)
+    (episodes, _, _), trajectory = jax.lax.scan(one_step, (state.env, *first), keys)
+    return state.replace(env=episodes, key=key), trajectory
+
+
+def improve(
+    env: Environment, state: TrainState, trajectory: Trajectory, advantage: Array, target: Array
+) -> tuple[TrainState, Metrics]:
+    """Epochs of mini-batch gradient steps, then the normalisers learn the batch (the old ones produced it)."""
+    config: PPOConfig = env.config.ppo
+    policy = state.policy
+    actor, critic = make_actor(env.config, env.robot.num_joints), make_critic(env.config)
+    optimizer = make_optimizer(env.config)
+    advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+    old_log_std = actor.apply(policy.actor, trajectory.actor_observation[0, :1])[1]
+    batch = {
+        "actor_observation": normalize(policy.actor_normalizer, trajectory.actor_observation),
+        "critic_observation": normalize(policy.critic_normalizer, trajectory.critic_observation),
+        "action": trajectory.action,
+        "log_prob": trajectory.log_prob,
+        "mean": trajectory.mean,
+        "value": trajectory.value,
+        "advantage": advantage,
+        "target": target,
+    }
+    batch = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
+    size = batch["value"].shape[0]
+
+    def loss_of(params, data: dict[str, Array]) -> tuple[Array, Metrics]:
+        mean, log_std = actor.apply(params[0], data["actor_observation"])
+        value = critic.apply(params[1], data["critic_observation"])
+        policy_term = policy_loss(log_prob(data["action"], mean, log_std) - data["log_prob"], data["advantage"], config.clip)
+        value_term = value_loss(value, data["value"], data["target"], config.clip if config.clip_value else None)
+        entropy_term = entropy(log_std)
+        loss = policy_term + config.value_cost * value_term - config.entropy_cost * entropy_term
+        kl = kl_divergence(data["mean"], old_log_std, mean, log_std).mean()
+        return loss, {"policy_loss": policy_term, "value_loss": value_term, "entropy": entropy_term, "kl": kl}
+
+    def minibatch(carry, indices: Array):
+        params, optimizer_state, learning_rate = carry
+        data = jax.tree.map(lambda x: x[indices], batch)
+        gradient, metrics = jax.grad(loss_of, has_aux=True)(params, data)
+        if config.schedule == "adaptive":
+            learning_rate = adapt_learning_rate(
+                learning_rate, metrics["kl"], config.target_kl, config.min_learning_rate, config.max_learning_rate
+            )
+        metrics["gradient_norm"] = optax.global_norm(gradient)
+        updates, optimizer_state = optimizer.update(gradient, optimizer_state)
+        params = jax.tree.map(lambda p, u: p - learning_rate * u, params, updates)
+        return (params, optimizer_state, learning_rate), metrics
+
+    def epoch(carry, key: Array):
+        indices = jax.random.permutation(key, size)[: size - size % config.minibatches]
+        return jax.lax.scan(minibatch, carry, indices.reshape(config.minibatches, -1))
+
+    key, epoch_key = jax.random.split(state.key)
+    carry = ((policy.actor, policy.critic), state.optimizer, state.learning_rate)
+    (params, optimizer_state, learning_rate), metrics = jax.lax.scan(
+        epoch, carry, jax.random.split(epoch_key, config.epochs)
+    )
+    metrics = {name: value.mean() for name, value in metrics.items()} | {"kl_final": metrics["kl"][-1].mean()}
+    metrics["learning_rate"] = learning_rate
+    metrics["std"] = jnp.exp(old_log_std).mean()
+    new_policy = Policy(
+        actor=params[0],
+        critic=params[1],
+        actor_normalizer=update_normalizer(policy.actor_normalizer, trajectory.actor_observation),
+        critic_normalizer=update_normalizer(policy.critic_normalizer, trajectory.critic_observation),
+    )
+    return state.replace(policy=new_policy, optimizer=optimizer_state, learning_rate=learning_rate, key=key), metrics
+
+
+def learn_sampler(
+    env: Environment, assets: Assets, state: TrainState, trajectory: Trajectory, losses: Metrics
+) -> tuple[TrainState, Metrics]:
+    """Failure levels learn from the ended episodes; the metrics of the iteration."""
+    config = env.config
+    done = trajectory.terminated | trajectory.truncated
+    failure_level = update_failure_level(
+        config.sampling, state.failure_level, done, trajectory.failure, trajectory.clip, trajectory.start_bin
+    )
+    diverged = trajectory.diverged.sum().astype(jnp.int32)
+    probabilities = bin_probabilities(config.sampling, assets.bins, failure_level)
+    metrics = losses | _metrics(env, assets, trajectory, done, probabilities) | {"diverged": diverged}
+    metrics["top_bin_probability"] = probabilities.max()
+    state = state.replace(
+        failure_level=failure_level, iteration=state.iteration + 1, diverged=state.diverged + diverged
+    )
+    return state, metrics
+
+
+def _metrics(env: Environment, assets: Assets, trajectory: Trajectory, done: Array, probabilities: Array) -> Metrics:
+    clips = len(assets.is_target)
+    flat_clip = trajectory.clip.reshape(-1)
+
+    def per_clip(values: Array) -> Array:
+        return jax.ops.segment_sum(values.reshape(-1).astype(jnp.float32), flat_clip, clips)
+
+    steps, ended = per_clip(jnp.ones_like(trajectory.reward)), per_clip(done)
+    ended_steps, completed = per_clip(trajectory.steps * done), per_clip(trajectory.truncated)
+    skill = per_clip((1.0 - trajectory.failure) * done)
+    tracking, regularisation = per_clip(trajectory.tracking), per_clip(trajectory.regularisation)
+    normalized = per_clip(trajectory.normalized_tracking)
+    metrics = {
+        "reward": trajectory.reward.mean(),
+        "value": trajectory.value.mean(),
+        "tracking_reward": trajectory.normalized_tracking.mean(),
+        "episode_length": ended_steps.sum() / jnp.maximum(ended.sum(), 1),
+        "completed": completed.sum() / jnp.maximum(ended.sum(), 1),
+        "wrench_gain": trajectory.wrench_gain.mean(),
+        "clip/steps": steps,
+        "clip/episodes": ended,
+        "clip/episode_length_sum": ended_steps,
+        "clip/completed": completed,
+        "clip/survival_weighted_sum": skill,
+        "clip/tracking_sum": normalized,
+        "clip/probability": probabilities.sum(-1),
+    }
+    metrics |= {f"terminated/{name}": value.sum() for name, value in trajectory.causes.items()}
+    from forgetmimic_jax.unlearning.antireward import threshold_metrics
+
+    return metrics | threshold_metrics(env.config, assets.is_target, steps, tracking, regularisation, normalized)
