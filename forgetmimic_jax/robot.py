@@ -96,6 +96,8 @@ def load_robot(
         raise InputError(f"robot '{name}': no robots/{name}/{name}.yaml; {nearest(name, known)}")
     path = robots_dir / name / f"{name}.yaml"
     roles = _read_roles(path)
+    if not (path.parent / roles["model"]).is_file():
+        raise InputError(f"{path}: model: no file '{roles['model']}'")
     spec = mujoco.MjSpec.from_file(str(path.parent / roles["model"]))
     spec.option.timestep = timestep
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -195,18 +197,27 @@ def load_robot(
 
 
 def _read_roles(path: Path) -> dict[str, Any]:
-    roles = yaml.safe_load(path.read_text())
-    required = ("model", "anchor", "key_bodies", "end_effectors", "feet", "natural_frequency_hz", "damping_ratio")
+    try:
+        roles = yaml.safe_load(path.read_text())
+    except yaml.YAMLError as error:
+        raise InputError(f"{path}: not YAML: {' '.join(str(error).split())}") from None
+    required: tuple[str, ...] = ("model", "anchor", "key_bodies", "end_effectors", "feet", "natural_frequency_hz", "damping_ratio")
     required += ("soft_limit_factor", "default_height", "motors", "joint_motors", "default_pose")
     for field in required:
         if not isinstance(roles, dict) or field not in roles:
             raise InputError(f"{path}: missing field '{field}'")
+    for name, motor in roles["motors"].items():
+        for field in ("armature", "effort", "velocity"):
+            if field not in motor:
+                raise InputError(f"{path}: motors: {name}: missing '{field}'")
     return roles
 
 
 def _motor_of(joint: str, roles: dict[str, Any], path: Path) -> dict[str, float]:
     for pattern, motor in roles["joint_motors"]:
         if re.fullmatch(pattern, joint):
+            if motor not in roles["motors"]:
+                raise InputError(f"{path}: joint_motors: no motor '{motor}'; {nearest(motor, roles['motors'])}")
             return roles["motors"][motor]
     raise InputError(f"{path}: joint_motors: no pattern matches joint '{joint}'")
 
