@@ -201,8 +201,8 @@ def _read_roles(path: Path) -> dict[str, Any]:
         roles = yaml.safe_load(path.read_text())
     except yaml.YAMLError as error:
         raise InputError(f"{path}: not YAML: {' '.join(str(error).split())}") from None
-    required: tuple[str, ...] = ("model", "anchor", "key_bodies", "end_effectors", "feet", "natural_frequency_hz", "damping_ratio")
-    required += ("soft_limit_factor", "default_height", "motors", "joint_motors", "default_pose")
+    required = ["model", "anchor", "key_bodies", "end_effectors", "feet", "natural_frequency_hz", "damping_ratio"]
+    required += ["soft_limit_factor", "default_height", "motors", "joint_motors", "default_pose"]
     for field in required:
         if not isinstance(roles, dict) or field not in roles:
             raise InputError(f"{path}: missing field '{field}'")
