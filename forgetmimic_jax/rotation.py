@@ -71,7 +71,7 @@ def angle_between(a: Array, b: Array) -> Array:
 
 
 def from_euler(rpy: Array) -> Array:
-    """Quaternion [..., 4] of roll, pitch, yaw [..., 3] in rad: first roll about x, then pitch about y, then yaw about z."""
+    """Quaternion [..., 4] of roll, pitch, yaw [..., 3] in rad: first about x, then y, then z, the fixed axes."""
     cr, cp, cy = jnp.moveaxis(jnp.cos(rpy / 2), -1, 0)
     sr, sp, sy = jnp.moveaxis(jnp.sin(rpy / 2), -1, 0)
     return jnp.stack(
