@@ -5,29 +5,27 @@
 ## ROBOT        a folder under robots/ (default: g1)
 ## TARGETS      clips to forget, comma-separated: punch,kick
 ## LAMBDA       penalty on the targets' tracking reward (default: 16)
-## PRESET       cpu or paper (default: by what this machine has)
+## PRESET       cpu or paper (default: cpu)
 ## PHYSICS      auto, native, mjx or mjx-warp (default: auto)
+## LIBRARY      folder of clips (default: data/ROBOT)
 ## ITERATIONS   training iterations
 ## SEED         random seed
-## CHECKPOINT   the policy to evaluate or to start from
+## BASE         the policy to start from (default: the shipped one; for pretrain, none)
+## CHECKPOINT   the policy to evaluate
 ## EPISODES     episodes a clip in an evaluation (default: 20)
-## OUTPUT       folder for the results (default: a new one under runs/)
+## OUTPUT       folder for the results (default: a folder under runs/)
 ## RESUME       1 goes on with the run in OUTPUT
 ## ARGS         any other flags, as they are; ARGS=--help lists them
 ## PYTHON       the Python that .venv is made from, 3.11 to 3.13 (default: the first found)
 ROBOT ?= g1
 
 MODULE = .venv/bin/python -m forgetmimic_jax
-RUN_FLAGS = --robot $(ROBOT) \
-	$(if $(PRESET),--preset $(PRESET)) \
-	$(if $(PHYSICS),--physics $(PHYSICS)) \
-	$(if $(SEED),--seed $(SEED)) \
-	$(if $(OUTPUT),--output $(OUTPUT))
-TRAIN_FLAGS = $(RUN_FLAGS) \
-	$(if $(ITERATIONS),--iterations $(ITERATIONS)) \
+flag = $(if $($(2)),--$(1) $($(2)))
+ROBOT_FLAGS = --robot $(ROBOT) $(call flag,physics,PHYSICS) $(call flag,library,LIBRARY)
+RUN_FLAGS = $(ROBOT_FLAGS) $(call flag,seed,SEED) $(call flag,output,OUTPUT)
+TRAIN_FLAGS = $(RUN_FLAGS) $(call flag,preset,PRESET) $(call flag,iterations,ITERATIONS) $(call flag,base,BASE) \
 	$(if $(RESUME),--resume)
-TARGET_FLAGS = $(if $(TARGETS),--targets $(TARGETS))
-POLICY_FLAGS = $(if $(CHECKPOINT),--checkpoint $(CHECKPOINT)) $(if $(EPISODES),--episodes $(EPISODES))
+TARGET_FLAGS = $(call flag,targets,TARGETS) $(call flag,episodes,EPISODES)
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
@@ -42,19 +40,19 @@ help: ## this list
 	@sed -n 's/^## /  /p' Makefile
 
 unlearn: .venv/.installed ## forget TARGETS, then evaluate base and unlearned policy side by side
-	$(MODULE).unlearn $(strip $(TRAIN_FLAGS) $(TARGET_FLAGS) $(if $(LAMBDA),--penalty $(LAMBDA)) $(POLICY_FLAGS) $(ARGS))
+	$(MODULE).unlearn $(strip $(TRAIN_FLAGS) $(TARGET_FLAGS) $(call flag,penalty,LAMBDA) $(ARGS))
 
 pretrain: .venv/.installed ## train a base policy on every clip
 	$(MODULE).train $(strip $(TRAIN_FLAGS) $(ARGS))
 
 evaluate: .venv/.installed ## evaluate CHECKPOINT clip by clip
-	$(MODULE).evaluate $(strip $(RUN_FLAGS) $(TARGET_FLAGS) $(POLICY_FLAGS) $(ARGS))
+	$(MODULE).evaluate $(strip $(RUN_FLAGS) $(TARGET_FLAGS) $(call flag,checkpoint,CHECKPOINT) $(ARGS))
 
 motions: .venv/.installed ## make a library from your own clips (ARGS=--help says how)
 	$(MODULE).motions $(strip --robot $(ROBOT) $(ARGS))
 
 bench: .venv/.installed ## steps per second of training on this machine
-	$(MODULE).bench $(strip $(RUN_FLAGS) $(ARGS))
+	$(MODULE).bench $(strip $(ROBOT_FLAGS) $(call flag,preset,PRESET) $(ARGS))
 
 tables: .venv/.installed ## rewrite the README's tables from the evaluation files they name
 	$(MODULE).evaluation.tables README.md
