@@ -44,6 +44,7 @@ class Robot:
     """What the host knows of a robot: the compiled model, names and indices."""
 
     name: str
+    spec: mujoco.MjSpec  # what `model` is compiled from
     model: mujoco.MjModel
     joint_names: tuple[str, ...]
     joint_velocity_limit: np.ndarray  # [joint] rad/s, the motor's no-load speed
@@ -176,6 +177,7 @@ def load_robot(
     )
     return Robot(
         name=name,
+        spec=spec,
         model=model,
         joint_names=joint_names,
         joint_velocity_limit=np.array([motor["velocity"] for motor in motors]),

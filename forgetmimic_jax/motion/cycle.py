@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
 
 from forgetmimic_jax.motion.deepmimic import HumanMotion
-from forgetmimic_jax.motion.kinematics import PlanarTransform, heading, interpolate, turn, wrap_angle
+from forgetmimic_jax.motion.kinematics import PlanarTransform, heading, turn, wrap_angle
 
 # A recorded gait that should go straight ends a few degrees off; a deliberate turn is larger than this.
 STRAIGHT_YAW = np.radians(30.0)
@@ -18,7 +19,8 @@ def resampled(motion: HumanMotion, fps: float, time_scale: float) -> tuple[Human
     """The motion at `fps` after stretching time by `time_scale`, and the planar step from cycle to cycle.
 
     A cyclic motion is given a whole number of frames a cycle (its last frame, which repeats the first, is left out),
-    so that tiling needs no further interpolation. A motion that does not repeat returns no step.
+    so that tiling needs no further interpolation. A motion that does not repeat returns no step. Interpolation is
+    cubic: the keyframed clips come at 16 to 30 frames per s, where straight lines would kink.
     """
     if motion.cyclic:
         motion, step = _closed(motion)
@@ -31,8 +33,8 @@ def resampled(motion: HumanMotion, fps: float, time_scale: float) -> tuple[Human
     return replace(
         motion,
         times=np.arange(count) / fps,
-        root_pos=interpolate(times, motion.times, motion.root_pos),
-        rotations={name: Slerp(motion.times, turns)(times) for name, turns in motion.rotations.items()},
+        root_pos=CubicSpline(motion.times, motion.root_pos)(times),
+        rotations={name: RotationSpline(motion.times, turns)(times) for name, turns in motion.rotations.items()},
     ), step
 
 

@@ -71,7 +71,8 @@ class Orientation:
 class Targets:
     """What the robot is asked to do, [frame, ...], world frame."""
 
-    hip_centre: np.ndarray  # [frame, 3] m, midpoint of the hip_roll bodies
+    hip_bodies: tuple[int, int]
+    hip_centre: np.ndarray  # [frame, 3] m, midpoint of the hip bodies
     orientations: tuple[Orientation, ...]
     vectors: tuple[Vector, ...]
     scale: float
@@ -111,7 +112,8 @@ def make_targets(robot: Robot, pose: HumanPose) -> Targets:
         for limb, body in HINGES.items():
             axis = pose.frames[f"{side}_{limb}"].apply([0.0, 1.0, 0.0])
             vectors.append(Vector(f"{side}_{limb}_hinge", None, model.body(f"{side}_{body}").id, axis, 0.15))
-    return Targets(pose.points["pelvis"] * scale, tuple(orientations), tuple(vectors), scale)
+    hips = (model.body("left_hip_roll_link").id, model.body("right_hip_roll_link").id)
+    return Targets(hips, pose.points["pelvis"] * scale, tuple(orientations), tuple(vectors), scale)
 
 
 class VectorTask(mink.Task):

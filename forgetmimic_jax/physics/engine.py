@@ -9,12 +9,13 @@ from typing import Literal, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax import Array
 
 from forgetmimic_jax import rotation
 from forgetmimic_jax.config import PhysicsConfig
-from forgetmimic_jax.robot import Robot
+from forgetmimic_jax.robot import CONTACT_SENSOR, Robot
 
 
 @struct.dataclass
@@ -42,7 +43,7 @@ class BodyState:
     quat: Array  # [env, key_body, 4] wxyz
     lin_vel: Array  # [env, key_body, 3] m/s
     ang_vel: Array  # [env, key_body, 3] rad/s
-    contact_force: Array  # [env, key_body, 3] N, from the floor, during the last physics step
+    contact_force: Array  # [env, key_body, 3] N of the floor on the body, world frame, during the last physics step
 
 
 class Engine(Protocol):
@@ -81,7 +82,23 @@ def body_state(xpos: Array, xquat: Array, cvel: Array, com: Array, contact_force
     """
     ang_vel, lin_vel_com = cvel[..., :3], cvel[..., 3:]
     lin_vel = lin_vel_com + jnp.cross(ang_vel, xpos - com[:, None])
-    return BodyState(pos=xpos, quat=rotation.normalize(xquat), lin_vel=lin_vel, ang_vel=ang_vel, contact_force=contact_force)
+    return BodyState(
+        pos=xpos, quat=rotation.normalize(xquat), lin_vel=lin_vel, ang_vel=ang_vel, contact_force=contact_force
+    )
+
+
+def select_rows(mask: Array, fresh: BodyState, old: BodyState) -> BodyState:
+    """Rows of `fresh` where mask [env] holds, of `old` elsewhere."""
+    return jax.tree.map(lambda new, was: jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, was), fresh, old)
+
+
+def contact_sensor_columns(robot: Robot) -> np.ndarray:
+    """Columns [key_body, 3] of `sensordata` that hold the force of each key body on the floor, N in the world frame.
+
+    MuJoCo gives the force of the sensor's first object on its second, the floor; an engine returns the opposite.
+    """
+    first = [int(robot.model.sensor(CONTACT_SENSOR + body).adr[0]) for body in robot.key_bodies]
+    return np.array(first)[:, None] + np.arange(3)
 
 
 def resolve_engine(name: Literal["auto", "native", "mjx", "mjx-warp"]) -> str:

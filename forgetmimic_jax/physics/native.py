@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import threading
 
 import jax
@@ -11,7 +12,14 @@ import mujoco.batch
 import numpy as np
 from jax import Array
 
-from forgetmimic_jax.physics.engine import BodyState, PhysicsParameters, PhysicsState, body_state
+from forgetmimic_jax.physics.engine import (
+    BodyState,
+    PhysicsParameters,
+    PhysicsState,
+    body_state,
+    contact_sensor_columns,
+    select_rows,
+)
 from forgetmimic_jax.robot import Robot
 
 _VELOCITY_STAGE = int(mujoco.mjtStage.mjSTAGE_VEL)
@@ -24,7 +32,7 @@ class NativeEngine:
     """
 
     def __init__(self, robot: Robot, substeps: int, num_envs: int, num_threads: int = 0):
-        model = robot.model
+        model = copy.copy(robot.model)
         # A diverged simulation must show as NaN, to be counted; MuJoCo's own reset would hide it.
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         mujoco.set_mju_user_warning(lambda message: None)
@@ -35,8 +43,10 @@ class NativeEngine:
         self._anchor = robot.anchor_body_id
         self._torso_com = model.body_ipos[self._anchor].copy()
         self._feet = robot.foot_geom_ids
-        self._num_envs = num_envs
-        self._outputs = {name: self._batch.bind(name) for name in ("xpos", "xquat", "cvel", "subtree_com", "sensordata")}
+        self._contact_columns = contact_sensor_columns(robot)
+        self._outputs = {
+            name: self._batch.bind(name) for name in ("xpos", "xquat", "cvel", "subtree_com", "sensordata")
+        }
         self._friction = self._batch.expand("geom_friction")
         self._body_ipos = self._batch.expand("body_ipos")
         keys = len(self._keys)
@@ -68,7 +78,7 @@ class NativeEngine:
             (state.qpos, state.qvel, state.warmstart, parameters.foot_friction, parameters.torso_com, mask),
         )
         fresh = body_state(xpos, xquat, cvel, com, jnp.zeros_like(bodies.contact_force))
-        return jax.tree.map(lambda new, old: jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old), fresh, bodies)
+        return select_rows(mask, fresh, bodies)
 
     def _load(self, qpos, qvel, warmstart, friction, torso_com) -> None:
         batch = self._batch
@@ -95,7 +105,7 @@ class NativeEngine:
             batch.ctrl[:] = target
             batch.xfrc_applied[:, self._anchor] = wrench
             batch.step(nstep=self._substeps, stage=_VELOCITY_STAGE)
-            force = self._outputs["sensordata"].reshape(self._num_envs, -1, 3).astype(np.float32)
+            force = -self._outputs["sensordata"][:, self._contact_columns].astype(np.float32)
             state = tuple(x.astype(np.float32) for x in (batch.qpos, batch.qvel, batch.qacc_warmstart))
             return (*state, *self._bodies(), force)
 

@@ -1,0 +1,194 @@
+"""Checkpoints: orbax trees, the config and a note of what they belong to, in a folder that appears whole or not at all.
+
+`policy/` holds what goes from one run to another (networks, normalisers, failure levels); `run/` all the rest of the
+TrainState, for resuming. A shipped checkpoint may lack `run/`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import orbax.checkpoint as ocp
+from jax import Array
+
+from forgetmimic_jax.config import Config, load_config, save_config
+from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.motion.library import MotionLibrary
+from forgetmimic_jax.robot import Robot
+from forgetmimic_jax.state import Policy, TrainState
+
+POLICY, RUN, CONFIG, META = "policy", "run", "config.yaml", "meta.json"
+SCHEMA = 1
+
+
+@dataclass(frozen=True)
+class CheckpointInfo:
+    """What a checkpoint says of itself."""
+
+    path: Path
+    config: Config
+    robot: str
+    joints: tuple[str, ...]
+    clips: tuple[str, ...]
+    library_hash: str
+    iteration: int
+    environment_steps: int
+
+
+def save_checkpoint(
+    path: Path,
+    state: TrainState,
+    config: Config,
+    robot: Robot,
+    library: MotionLibrary,
+    library_hash: str,
+    *,
+    environment_steps: int,
+    resumable: bool = True,
+) -> None:
+    """Write a run's state to folder `path`; one of the same name is replaced only once the new one is complete.
+
+    Args:
+        path: the checkpoint's folder.
+        state: of the run.
+        config: of the run.
+        robot: the robot trained.
+        library: the clips trained on.
+        library_hash: of those clips.
+        environment_steps: control steps lived so far, all environments together.
+        resumable: with `run/`; without, the checkpoint is small and serves evaluation and warm starts only.
+    """
+    state = jax.tree.map(np.asarray, state)
+    trees: dict[str, Any] = {POLICY: {"policy": state.policy, "failure_level": state.failure_level}}
+    if resumable:
+        trees[RUN] = _run_part(state)
+    meta = {
+        "schema": SCHEMA,
+        "robot": robot.name,
+        "joints": list(robot.joint_names),
+        "clips": list(library.names),
+        "library_hash": library_hash,
+        "iteration": int(state.iteration),
+        "environment_steps": environment_steps,
+    }
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir(parents=True)
+    try:
+        with ocp.StandardCheckpointer() as checkpointer:
+            for name, tree in trees.items():
+                checkpointer.save((temporary / name).resolve(), tree)
+                checkpointer.wait_until_finished()
+        save_config(config, temporary / CONFIG)
+        (temporary / META).write_text(json.dumps(meta, indent=2) + "\n")
+        shutil.rmtree(path, ignore_errors=True)
+        temporary.rename(path)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def read_info(path: Path) -> CheckpointInfo:
+    """A checkpoint's note and config.
+
+    Raises:
+        InputError: not a checkpoint, or a damaged one.
+    """
+    if not path.is_dir():
+        raise InputError(f"{path}: no such checkpoint folder")
+    try:
+        meta = json.loads((path / META).read_text())
+        known = dict(
+            robot=meta["robot"],
+            joints=tuple(meta["joints"]),
+            clips=tuple(meta["clips"]),
+            library_hash=meta["library_hash"],
+            iteration=int(meta["iteration"]),
+            environment_steps=int(meta["environment_steps"]),
+        )
+    except FileNotFoundError:
+        raise InputError(f"{path}: not a checkpoint: no {META}") from None
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path / META}: damaged: {error}") from None
+    return CheckpointInfo(path=path, config=load_config(path / CONFIG), **known)
+
+
+def check_matches(info: CheckpointInfo, robot: Robot, library: MotionLibrary, library_hash: str, config: Config) -> None:
+    """Say which of robot, joints, library or network differs between a checkpoint and what is asked.
+
+    Raises:
+        InputError: something differs.
+    """
+    if info.robot != robot.name or info.joints != robot.joint_names:
+        raise InputError(f"{info.path}: robot: the checkpoint's is '{info.robot}' ({len(info.joints)} joints), asked "
+                         f"for '{robot.name}' ({robot.num_joints} joints)")  # fmt: skip
+    if info.clips != library.names or info.library_hash != library_hash:
+        missing, added = set(info.clips) - set(library.names), set(library.names) - set(info.clips)
+        difference = "; ".join(
+            part
+            for part in (
+                f"missing here: {', '.join(sorted(missing))}" if missing else "",
+                f"new here: {', '.join(sorted(added))}" if added else "",
+            )
+            if part
+        )
+        raise InputError(
+            f"{info.path}: library: the checkpoint's hash is {info.library_hash}, this library's {library_hash} "
+            f"({difference or 'same clip names, other content'})"
+        )
+    for field in ("actor_layers", "critic_layers"):
+        theirs, ours = getattr(info.config.ppo, field), getattr(config.ppo, field)
+        if theirs != ours:
+            raise InputError(f"{info.path}: ppo.{field}: the checkpoint's is {list(theirs)}, asked for {list(ours)}")
+
+
+def load_policy(path: Path, template: TrainState) -> tuple[Policy, Array]:
+    """Policy and failure levels of a checkpoint; `template` gives the shapes (`jax.eval_shape` of `init_state`)."""
+    with _explained(path):
+        tree = _restore(path / POLICY, {"policy": template.policy, "failure_level": template.failure_level})
+        return tree["policy"], tree["failure_level"]
+
+
+def load_state(path: Path, template: TrainState) -> TrainState:
+    """The whole TrainState of a resumable checkpoint."""
+    if not (path / RUN).is_dir():
+        raise InputError(f"{path}: holds a policy but no {RUN}/ to resume from; start a new run with --base {path}")
+    with _explained(path):
+        policy = _restore(path / POLICY, {"policy": template.policy, "failure_level": template.failure_level})
+        return template.replace(**policy, **_restore(path / RUN, _run_part(template)))
+
+
+def newest_checkpoint(directory: Path) -> Path | None:
+    """The checkpoint of the highest iteration under `directory`/checkpoints, if any."""
+    found = [path for path in (directory / "checkpoints").glob("[0-9]*") if (path / META).is_file()]
+    return max(found, key=lambda path: int(path.name), default=None)
+
+
+def _run_part(state: TrainState) -> dict[str, Any]:
+    return {name: getattr(state, name) for name in vars(state) if name not in ("policy", "failure_level")}
+
+
+def _restore(path: Path, template: Any) -> Any:
+    abstract = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), template)
+    with ocp.StandardCheckpointer() as checkpointer:
+        return checkpointer.restore(path.resolve(), abstract)
+
+
+@contextlib.contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    # Orbax reports a damaged tree by many exception types; all of them mean the same to a user.
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        first = str(error).strip().splitlines() or [type(error).__name__]
+        raise InputError(f"{path}: damaged, incomplete or of another shape: {first[0][:200]}") from error

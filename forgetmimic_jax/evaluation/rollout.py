@@ -1,0 +1,161 @@
+"""The evaluation protocol: deterministic actions, no wrench, no randomisation, the clip pinned, no roll-over.
+
+Start frames and reset noise depend on the seed alone, so that every policy meets the same episodes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from forgetmimic_jax import rotation
+from forgetmimic_jax.config import Config
+from forgetmimic_jax.evaluation.metrics import Rollout
+from forgetmimic_jax.motion.library import MotionLibrary
+from forgetmimic_jax.ppo.network import normalize
+from forgetmimic_jax.robot import Robot
+from forgetmimic_jax.state import Policy, make_actor
+from forgetmimic_jax.tracking import env as tracking
+from forgetmimic_jax.tracking.env import Assets, Environment, EnvState, StepResult
+from forgetmimic_jax.tracking.reference import align_to_anchor
+
+CHUNK = 50  # control steps between two looks whether every episode has ended
+SHORTEST_START = 25  # a start frame leaves at least so many steps, so that no episode is trivially short
+CONTACT_FORCE = 1.0  # N, above which a foot counts as standing
+
+
+class Evaluator:
+    """Rolls policies out on the same episodes of one library. Compiled once, used for any number of policies."""
+
+    def __init__(self, config: Config, robot: Robot, library: MotionLibrary, *, episodes: int, seed: int):
+        self.config = evaluation_config(config)
+        self.clip, self.start_frame = episode_starts(np.asarray(library.length), episodes, seed)
+        self._seed = seed
+        self._env = tracking.make_environment(self.config, robot, len(self.clip), noisy=False)
+        self._assets = tracking.make_assets(self.config, robot, library)
+        self._begin = jax.jit(self._begin_episodes)
+        self._advance = jax.jit(self._advance_chunk)
+
+    def rollout(self, policy: Policy | None) -> Rollout:
+        """Every episode with `policy`'s mean action; None is the zero action."""
+        env = self._env
+        state = self._begin(self._assets, jax.random.PRNGKey(self._seed))
+        horizon = np.asarray(state.horizon)
+        length = horizon.copy()
+        ended = np.zeros(env.num_envs, bool)
+        diverged = np.zeros(env.num_envs, bool)
+        records = []
+        for begin in range(0, int(horizon.max()), CHUNK):
+            state, record = jax.device_get(self._advance(self._assets, policy, state))
+            terminated, blew_up = record.pop("terminated"), record.pop("diverged")
+            records.append(record)
+            for offset in range(CHUNK):
+                now = terminated[offset] & ~ended & (begin + offset < horizon)
+                length[now] = np.maximum(begin + offset, 1)
+                diverged |= now & blew_up[offset]
+                ended |= now
+            if (ended | (begin + CHUNK >= horizon)).all():
+                break
+        steps = int(horizon.max())
+        series = {}
+        for name in records[0]:
+            values = np.concatenate([record[name] for record in records])[:steps].T
+            series[name] = np.pad(values, ((0, 0), (0, steps - values.shape[1])))
+        return Rollout(
+            clip=self.clip,
+            start_frame=self.start_frame,
+            horizon=horizon,
+            length=length,
+            tracking_reward=series.pop("tracking_reward"),
+            errors=series,
+            nan_resets=int(diverged.sum()),
+        )
+
+    def _begin_episodes(self, assets: Assets, key: Array) -> EnvState:
+        n = self._env.num_envs
+        clip, frame = jnp.asarray(self.clip, jnp.int32), jnp.asarray(self.start_frame, jnp.int32)
+        zeros = jnp.zeros((n,), jnp.int32)
+        state = tracking.start_episodes(self._env, assets, key, clip, zeros, frame, zeros.astype(jnp.float32))
+        return tracking.refresh_bodies(self._env, state, jnp.ones((n,), bool))
+
+    def _advance_chunk(self, assets: Assets, policy: Policy | None, state: EnvState):
+        env = self._env
+        actor = make_actor(env.config, env.robot.num_joints)
+
+        def one_step(state: EnvState, key: Array):
+            if policy is None:
+                action = jnp.zeros((env.num_envs, env.robot.num_joints), jnp.float32)
+            else:
+                observation = tracking.observe(env, assets, state, None)[0]
+                action = actor.apply(policy.actor, normalize(policy.actor_normalizer, observation))[0]
+            state, result = tracking.step(env, assets, state, action, key)
+            record = step_errors(env, assets, state, result)
+            record |= {
+                "tracking_reward": result.reward.normalized_tracking,
+                "terminated": result.terminated,
+                "diverged": result.diverged,
+            }
+            return state, record
+
+        return jax.lax.scan(one_step, state, jax.random.split(jax.random.PRNGKey(0), CHUNK))
+
+
+def evaluation_config(config: Config) -> Config:
+    """The config with randomisation and the wrench off; reset noise stays."""
+    return dataclasses.replace(
+        config,
+        noise=dataclasses.replace(config.noise, enabled=False),
+        wrench=dataclasses.replace(config.wrench, max_gain=0.0),
+    )
+
+
+def episode_starts(lengths: np.ndarray, episodes: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Clip and start frame, i[clip · episodes]: half from frame 0, half stratified over the clip.
+
+    Args:
+        lengths: i[clip] frames.
+        episodes: a clip.
+        seed: of the frames inside the strata.
+    """
+    rng = np.random.default_rng(seed)
+    stratified = episodes // 2
+    starts = []
+    for length in lengths:
+        last = max(1, int(length) - 1 - SHORTEST_START)
+        offsets = (np.arange(stratified) + rng.random(stratified)) / max(stratified, 1)
+        starts.append(np.concatenate([np.zeros(episodes - stratified, int), np.floor(offsets * last).astype(int)]))
+    return np.repeat(np.arange(len(lengths)), episodes), np.concatenate(starts)
+
+
+def step_errors(env: Environment, assets: Assets, state: EnvState, result: StepResult) -> dict[str, Array]:
+    """The field's standard tracking errors and the paper's physical measures after a step, each [env].
+
+    mpkpe and root_relative_mpkpe in m (the second after moving the reference to the robot's anchor),
+    joint_position_error in rad and joint_velocity_error in rad/s (root mean squares over joints), end_effector_error
+    in m (re-anchored), anchor errors in m and rad, max_key_body_position_error in m (re-anchored), the share of feet
+    in contact, and the share of joints beyond their soft limits.
+    """
+    robot, bodies, reference = env.robot, state.bodies, result.reference
+    anchor = robot.anchor
+    aligned = align_to_anchor(reference, anchor, bodies.pos[:, anchor], bodies.quat[:, anchor])
+    joint_pos, joint_vel = state.physics.qpos[:, 7:], state.physics.qvel[:, 6:]
+    world = jnp.linalg.norm(reference.body_pos - bodies.pos, axis=-1)
+    relative = jnp.linalg.norm(aligned.pos - bodies.pos, axis=-1)
+    feet = jnp.linalg.norm(bodies.contact_force[:, robot.feet], axis=-1)
+    outside = (joint_pos < assets.robot.soft_lower) | (joint_pos > assets.robot.soft_upper)
+    return {
+        "mpkpe": world.mean(-1),
+        "root_relative_mpkpe": relative.mean(-1),
+        "joint_position_error": jnp.sqrt(((reference.joint_pos - joint_pos) ** 2).mean(-1)),
+        "joint_velocity_error": jnp.sqrt(((reference.joint_vel - joint_vel) ** 2).mean(-1)),
+        "end_effector_error": relative[:, robot.end_effectors].mean(-1),
+        "anchor_position_error": world[:, anchor],
+        "anchor_orientation_error": rotation.angle_between(reference.body_quat[:, anchor], bodies.quat[:, anchor]),
+        "max_key_body_position_error": relative.max(-1),
+        "foot_contact": (feet > CONTACT_FORCE).mean(-1),
+        "joint_limit_violation": outside.mean(-1),
+    }

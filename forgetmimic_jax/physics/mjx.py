@@ -1,0 +1,153 @@
+"""MJX: the same physics as an XLA (`jax`) or a Warp (`warp`) program, the engine on accelerators."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import io
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax import Array
+
+from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.physics.engine import (
+    BodyState,
+    PhysicsParameters,
+    PhysicsState,
+    body_state,
+    contact_sensor_columns,
+    select_rows,
+)
+from forgetmimic_jax.robot import Robot
+
+with contextlib.redirect_stdout(io.StringIO()):  # without warp, the import prints that it is missing
+    from mujoco import mjx
+    from mujoco.mjx._src import support
+
+# Room per environment in Warp's arrays (paper, appendix 'Simulation'); the jax implementation sizes its own.
+WARP_CONTACTS = 35
+WARP_CONSTRAINTS = 250
+
+
+class MjxEngine:
+    """`mjx.step` under `vmap`; the model's randomised values enter as mapped leaves of the model."""
+
+    def __init__(self, robot: Robot, substeps: int, implementation: Literal["jax", "warp"] = "jax"):
+        if implementation == "warp" and importlib.util.find_spec("warp") is None:
+            raise InputError("physics engine 'mjx-warp': warp is not installed; pip install 'mujoco-mjx[warp]'")
+        self._robot = robot
+        self._substeps = substeps
+        self._implementation = implementation
+        self._keys = robot.key_body_ids
+        self._anchor = robot.anchor_body_id
+        self._feet = robot.foot_geom_ids
+        self._floor = robot.model.geom("floor").id
+        plain = _without_contact_sensors(robot.spec)
+        # Bodies at the new state are always computed in jax: Warp gives velocities only inside a whole step.
+        self._body_model = mjx.put_model(plain, impl="jax")
+        self._body_data = mjx.make_data(plain, impl="jax")
+        self._model = self._body_model if implementation == "jax" else mjx.put_model(robot.model, impl="warp")
+
+    @property
+    def num_contacts(self) -> int:
+        """Contact points per environment that the jax implementation computes, touching or not."""
+        return int(self._body_data._impl.ncon)
+
+    def step(
+        self, state: PhysicsState, parameters: PhysicsParameters, target: Array, wrench: Array
+    ) -> tuple[PhysicsState, BodyState]:
+        """See `Engine.step`."""
+        start = self._start(state.qpos.shape[0])
+
+        def one(
+            state: PhysicsState, parameters: PhysicsParameters, target: Array, wrench: Array
+        ) -> tuple[PhysicsState, Array]:
+            model = self._model.tree_replace(
+                {
+                    "geom_friction": self._model.geom_friction.at[self._feet, 0].set(parameters.foot_friction),
+                    "body_ipos": self._model.body_ipos.at[self._anchor].add(parameters.torso_com),
+                }
+            )
+            data = start.replace(
+                qpos=state.qpos,
+                qvel=state.qvel,
+                qacc_warmstart=state.warmstart,
+                ctrl=target,
+                xfrc_applied=start.xfrc_applied.at[self._anchor].set(wrench),
+            )
+            data, _ = jax.lax.scan(lambda d, _: (mjx.step(model, d), None), data, length=self._substeps)
+            return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart), self._contact_force(model, data)
+
+        # An accelerator's default precision for products (TF32, bfloat16) would ruin the solver.
+        with jax.default_matmul_precision("highest"):
+            state, force = jax.vmap(one)(state, parameters, target, wrench)
+            return state, self._bodies(state, force)
+
+    def forward(self, state: PhysicsState, parameters: PhysicsParameters, mask: Array, bodies: BodyState) -> BodyState:
+        """See `Engine.forward`."""
+        # Friction and centre of mass move no body's origin.
+        with jax.default_matmul_precision("highest"):
+            return select_rows(mask, self._bodies(state, jnp.zeros_like(bodies.contact_force)), bodies)
+
+    def _start(self, num_envs: int) -> mjx.Data:
+        """The data of one environment at rest, with Warp's contact arrays large enough for all of them."""
+        if self._implementation == "jax":
+            return self._body_data
+        return _warp_data(self._robot, num_envs)
+
+    def _bodies(self, state: PhysicsState, force: Array) -> BodyState:
+        """Key bodies at `state`, with the contact forces [env, key_body, 3] given."""
+
+        def one(qpos: Array, qvel: Array) -> tuple[Array, ...]:
+            data = self._body_data.replace(qpos=qpos, qvel=qvel)
+            for stage in (mjx.kinematics, mjx.com_pos, mjx.com_vel):
+                data = stage(self._body_model, data)
+            keys = self._keys
+            return data.xpos[keys], data.xquat[keys], data.cvel[keys], data.subtree_com[1]
+
+        xpos, xquat, cvel, com = jax.vmap(one)(state.qpos, state.qvel)
+        return body_state(xpos, xquat, cvel, com, force)
+
+    def _contact_force(self, model: mjx.Model, data: mjx.Data) -> Array:
+        """Force [key_body, 3] N of the floor on each key body in one environment's last physics step."""
+        if self._implementation == "warp":
+            return -data.sensordata[contact_sensor_columns(self._robot)]
+        contact = data._impl.contact
+        total = jnp.zeros((len(self._keys), 3))
+        for dim in np.unique(contact.dim):
+            force, ids = support.contact_force_dim(model, data, dim)  # [contact, 6], normal first
+            force = jnp.einsum("cij,ci->cj", contact.frame[ids], force[:, :3])
+            # A plane comes first in MJX's pairs, and the normal points from the first shape to the second.
+            floor, geom = contact.geom[ids].T
+            body = jnp.asarray(model.geom_bodyid)[geom]
+            mine = (body == self._keys[:, None]) & (floor == self._floor)
+            total += mine.astype(force.dtype) @ force
+        return total
+
+
+def _without_contact_sensors(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """The model without its contact sensors, which the jax implementation lacks; forces come from the contacts."""
+    spec = spec.copy()
+    for sensor in list(spec.sensors):
+        if sensor.type == mujoco.mjtSensor.mjSENS_CONTACT:
+            spec.delete(sensor)
+    return spec.compile()
+
+
+def _warp_data(robot: Robot, num_envs: int) -> mjx.Data:
+    """Warp's data for one of `num_envs` environments."""
+    with jax.ensure_compile_time_eval():
+        data = mjx.make_data(robot.model, impl="warp", naconmax=WARP_CONTACTS * num_envs, njmax=WARP_CONSTRAINTS)
+    return jax.tree.map(_broadcast_constant, data)
+
+
+def _broadcast_constant(leaf: Array) -> Array:
+    """`leaf`, as a broadcast where it holds one value only: large scratch is then not stored in the executable."""
+    values = np.asarray(leaf)
+    if values.size > 1 and (values == values.flat[0]).all():
+        return jnp.full(values.shape, values.flat[0], values.dtype)
+    return leaf

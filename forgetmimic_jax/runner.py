@@ -1,0 +1,244 @@
+"""A run: iterate, log, checkpoint, stop and resume. Training and unlearning are both this."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+import signal
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from forgetmimic_jax import checkpoint
+from forgetmimic_jax.config import Config, save_config
+from forgetmimic_jax.console import progress
+from forgetmimic_jax.errors import InputError, nearest
+from forgetmimic_jax.motion.library import DATA_DIR, MotionLibrary, library_hash, load_library
+from forgetmimic_jax.ppo.update import make_iteration
+from forgetmimic_jax.robot import Robot, load_robot
+from forgetmimic_jax.state import TrainState, init_state
+from forgetmimic_jax.tracking.env import Assets, Environment, make_assets, make_environment
+
+KEEP = 2  # newest checkpoints kept beside the named ones
+LOG_EVERY = 10  # iterations averaged into one row of metrics.jsonl
+
+
+@dataclass(frozen=True)
+class Setup:
+    """A config, resolved: robot, clips and environment."""
+
+    config: Config
+    robot: Robot
+    library: MotionLibrary
+    library_hash: str
+    env: Environment
+    assets: Assets
+
+
+def make_setup(config: Config) -> Setup:
+    """Load what a config names; bad names are told before anything is written."""
+    robot = load_robot(
+        config.robot,
+        timestep=config.physics.timestep,
+        solver_iterations=config.physics.solver_iterations,
+        line_search_iterations=config.physics.line_search_iterations,
+        self_collision=config.physics.self_collision,
+    )
+    folder = DATA_DIR / robot.name if config.library is None else Path(config.library)
+    library = load_library(robot, folder)
+    check_targets(config.unlearn.targets, library.names)
+    env = make_environment(config, robot, config.ppo.num_envs)
+    return Setup(config, robot, library, library_hash(folder), env, make_assets(config, robot, library))
+
+
+def template(setup: Setup) -> TrainState:
+    """Shapes of the run's TrainState."""
+    return jax.eval_shape(lambda key: init_state(setup.env, setup.assets, key), jax.random.PRNGKey(0))
+
+
+def start_state(setup: Setup, base: Path | None) -> TrainState:
+    """A fresh run's state; with `base` a warm start from that checkpoint's policy."""
+    key = jax.random.PRNGKey(setup.config.seed)
+    if base is None:
+        return jax.jit(lambda assets, key: init_state(setup.env, assets, key))(setup.assets, key)
+    info = checkpoint.read_info(base)
+    checkpoint.check_matches(info, setup.robot, setup.library, setup.library_hash, setup.config)
+    policy, failure = checkpoint.load_policy(base, template(setup))
+    start = jax.jit(lambda assets, key, policy, failure: init_state(setup.env, assets, key, policy, failure))
+    return start(setup.assets, key, policy, failure if setup.config.sampling.rule == "frozen" else None)
+
+
+def check_targets(targets: tuple[str, ...], names: tuple[str, ...]) -> None:
+    """Targets must be clips of the library, and not all of them.
+
+    Raises:
+        InputError: an unknown clip, or nothing left to keep.
+    """
+    for target in targets:
+        if target not in names:
+            raise InputError(f"targets: no clip '{target}' in the library; {nearest(target, names)}")
+    if targets and set(targets) == set(names):
+        raise InputError(f"targets: all {len(names)} clips of the library; leave at least one to keep")
+
+
+def prepare_folder(directory: Path, *, resume: bool) -> Path | None:
+    """The newest checkpoint to resume from; without `resume` the folder must be new or empty.
+
+    Raises:
+        InputError: the folder exists, or there is nothing to resume.
+    """
+    if resume:
+        newest = checkpoint.newest_checkpoint(directory)
+        if newest is None:
+            raise InputError(f"{directory}: --resume finds no checkpoint there; leave it out to start")
+        return newest
+    if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
+        raise InputError(f"{directory}: exists already; choose another --output, or go on with --resume")
+    return None
+
+
+def run(
+    setup: Setup,
+    directory: Path,
+    *,
+    description: str,
+    base: Path | None = None,
+    resume: bool = False,
+) -> tuple[Path, TrainState]:
+    """Train until `config.iterations`; returns the last checkpoint's folder and the state.
+
+    The folder gets config.yaml, metrics.jsonl (means over LOG_EVERY iterations), TensorBoard events and checkpoints/.
+    Ctrl-C and SIGTERM end the current iteration, save, and raise KeyboardInterrupt.
+    """
+    config = setup.config
+    newest = prepare_folder(directory, resume=resume)
+    if newest is None:
+        state = start_state(setup, base)
+        directory.mkdir(parents=True, exist_ok=True)
+        save_config(config, directory / "config.yaml")
+        environment_steps = 0
+    else:
+        info = checkpoint.read_info(newest)
+        checkpoint.check_matches(info, setup.robot, setup.library, setup.library_hash, config)
+        state = checkpoint.load_state(newest, template(setup))
+        environment_steps = info.environment_steps
+        _drop_rows_after(directory / "metrics.jsonl", info.iteration)
+    iteration = int(state.iteration)
+    steps_per_iteration = config.ppo.num_envs * config.ppo.num_steps
+    iterate = make_iteration(setup.env)
+    saved: Path | None = newest
+
+    def save() -> Path:
+        path = directory / "checkpoints" / f"{iteration:08d}"
+        checkpoint.save_checkpoint(
+            path, state, config, setup.robot, setup.library, setup.library_hash, environment_steps=environment_steps
+        )
+        for old in sorted((directory / "checkpoints").glob("[0-9]*"))[:-KEEP]:
+            shutil.rmtree(old)
+        return path
+
+    with _Log(directory) as log, _stop_requests() as stop, progress(
+        description, config.iterations, start=iteration
+    ) as report:
+        while iteration < config.iterations and not stop:
+            state, metrics = iterate(setup.assets, state)
+            metrics = jax.device_get(metrics)
+            iteration += 1
+            environment_steps += steps_per_iteration
+            log.add(metrics)
+            if iteration % LOG_EVERY == 0 or iteration == config.iterations:
+                log.write(iteration, environment_steps, setup.library.names)
+            report(iteration, environment_steps, _live(metrics))
+            if iteration % config.checkpoint_every == 0:
+                saved = save()
+        if saved is None or int(saved.name) != iteration:
+            saved = save()
+    if stop and iteration < config.iterations:
+        raise KeyboardInterrupt
+    return saved, state
+
+
+def _live(metrics: Mapping[str, np.ndarray]) -> dict[str, float]:
+    shown = {"episode_length": metrics["episode_length"], "tracking": metrics["tracking_reward"]}
+    if "target/tracking_reward" in metrics:
+        shown |= {"target_tracking": metrics["target/tracking_reward"], "kept": metrics["kept/tracking_reward"]}
+    return {name: float(value) for name, value in shown.items()}
+
+
+class _Log:
+    """metrics.jsonl and TensorBoard events: means over the iterations since the last row."""
+
+    def __init__(self, directory: Path):
+        from tensorboardX import SummaryWriter
+
+        self._file = (directory / "metrics.jsonl").open("a")
+        self._events = SummaryWriter(str(directory / "events"))
+        self._rows: list[Mapping[str, np.ndarray]] = []
+
+    def __enter__(self) -> _Log:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+        self._events.close()
+
+    def add(self, metrics: Mapping[str, np.ndarray]) -> None:
+        self._rows.append(metrics)
+
+    def write(self, iteration: int, environment_steps: int, clips: tuple[str, ...]) -> None:
+        rows, self._rows = self._rows, []
+        mean = {name: np.mean([row[name] for row in rows], axis=0) for name in rows[0]}
+        out: dict[str, Any] = {"iteration": iteration, "environment_steps": environment_steps}
+        out |= {name: float(value) for name, value in mean.items() if np.ndim(value) == 0}
+        episodes = np.maximum(mean["clip/episodes"], 1e-9)
+        steps = np.maximum(mean["clip/steps"], 1e-9)
+        per_clip = {
+            "success": mean["clip/completed"] / episodes,
+            "survival_weighted_tracking": mean["clip/survival_weighted_sum"] / episodes,
+            "episode_length": mean["clip/episode_length_sum"] / episodes,
+            "tracking_reward": mean["clip/tracking_sum"] / steps,
+            "probability": mean["clip/probability"],
+            "step_share": steps / steps.sum(),
+        }
+        out["clips"] = {
+            clip: {name: round(float(values[i]), 5) for name, values in per_clip.items()} for i, clip in enumerate(clips)
+        }
+        self._file.write(json.dumps(out) + "\n")
+        self._file.flush()
+        for name, value in out.items():
+            if isinstance(value, float):
+                self._events.add_scalar(name, value, environment_steps)
+        for clip, values in out["clips"].items():
+            for name, value in values.items():
+                self._events.add_scalar(f"{clip}/{name}", value, environment_steps)
+        self._events.flush()
+
+
+def _drop_rows_after(path: Path, iteration: int) -> None:
+    """Rows logged after the checkpoint that is resumed from would be logged twice."""
+    if path.exists():
+        rows = [line for line in path.read_text().splitlines() if json.loads(line)["iteration"] <= iteration]
+        path.write_text("".join(f"{row}\n" for row in rows))
+
+
+@contextlib.contextmanager
+def _stop_requests() -> Iterator[list[int]]:
+    """A list that becomes non-empty at Ctrl-C or SIGTERM; a second Ctrl-C interrupts at once."""
+    received: list[int] = []
+
+    def ask(number: int, _frame: object) -> None:
+        if received:
+            raise KeyboardInterrupt
+        received.append(number)
+
+    old = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield received
+    finally:
+        for number, handler in old.items():
+            signal.signal(number, handler)
