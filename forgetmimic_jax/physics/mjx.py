@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import io
 from typing import Literal
 
@@ -25,6 +24,7 @@ from forgetmimic_jax.physics.engine import (
 from forgetmimic_jax.robot import Robot
 
 with contextlib.redirect_stdout(io.StringIO()):  # without warp, the import prints that it is missing
+    import mujoco.mjx.warp
     from mujoco import mjx
     from mujoco.mjx._src import support
 
@@ -34,10 +34,10 @@ WARP_CONSTRAINTS = 250
 
 
 class MjxEngine:
-    """`mjx.step` under `vmap`; the model's randomised values enter as mapped leaves of the model."""
+    """MJX under `vmap`; the model's randomised values enter as mapped leaves of the model."""
 
     def __init__(self, robot: Robot, substeps: int, implementation: Literal["jax", "warp"] = "jax"):
-        if implementation == "warp" and importlib.util.find_spec("warp") is None:
+        if implementation == "warp" and not mujoco.mjx.warp.WARP_INSTALLED:
             raise InputError("physics engine 'mjx-warp': warp is not installed; pip install 'mujoco-mjx[warp]'")
         self._robot = robot
         self._substeps = substeps
@@ -62,6 +62,7 @@ class MjxEngine:
     ) -> tuple[PhysicsState, BodyState]:
         """See `Engine.step`."""
         start = self._start(state.qpos.shape[0])
+        physics_step = mjx.step if self._implementation == "warp" else _step
 
         def one(
             state: PhysicsState, parameters: PhysicsParameters, target: Array, wrench: Array
@@ -79,7 +80,7 @@ class MjxEngine:
                 ctrl=target,
                 xfrc_applied=start.xfrc_applied.at[self._anchor].set(wrench),
             )
-            data, _ = jax.lax.scan(lambda d, _: (mjx.step(model, d), None), data, length=self._substeps)
+            data, _ = jax.lax.scan(lambda d, _: (physics_step(model, d), None), data, length=self._substeps)
             return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart), self._contact_force(model, data)
 
         # An accelerator's default precision for products (TF32, bfloat16) would ruin the solver.
@@ -127,6 +128,19 @@ class MjxEngine:
             mine = (body == self._keys[:, None]) & (floor == self._floor)
             total += mine.astype(force.dtype) @ force
         return total
+
+
+def _step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """`mjx.step` for implicitfast, with the other engines' rule for saturated motors.
+
+    A motor at its torque limit does not answer to velocity, so C and Warp leave its damping out of the implicit
+    integration; `mjx.step` keeps it, which slows a saturated joint by rad/s within a control step.
+    """
+    data = mjx.forward(model, data)
+    lower, upper = model.actuator_forcerange.T
+    saturated = model.actuator_forcelimited & ((data.actuator_force <= lower) | (data.actuator_force >= upper))
+    damping = jnp.where(saturated, 0.0, model.actuator_biasprm[:, 2])
+    return mjx.implicit(model.tree_replace({"actuator_biasprm": model.actuator_biasprm.at[:, 2].set(damping)}), data)
 
 
 def _without_contact_sensors(spec: mujoco.MjSpec) -> mujoco.MjModel:

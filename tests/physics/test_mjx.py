@@ -1,0 +1,148 @@
+"""MJX against the native engine, which test_native.py holds to plain MuJoCo."""
+
+import contextlib
+import faulthandler
+import sys
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import mujoco.mjx.warp
+import numpy as np
+import pytest
+from physics_cases import CASES, FLIGHT, SUBSTEPS
+
+from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.physics.mjx import WARP_CONSTRAINTS, WARP_CONTACTS, MjxEngine
+from forgetmimic_jax.robot import load_robot
+
+HANG = 600  # s: far above any compilation here
+# Half the compilation, the same program.
+QUICK_COMPILATION = {"xla_backend_optimization_level": 0}
+
+# Single against double precision over one control step: about ten times the differences found (CPU, jax 0.10.2,
+# MuJoCo 4.0.0, mujoco-mjx 3.17), all of them float32's rounding. qpos m and rad, velocities m/s and rad/s,
+# accelerations of up to 970 rad/s^2, forces of up to 163 N.
+TOLERANCE = {"qpos": 5e-6, "qvel": 3e-4, "warmstart": 0.05, "contact_force": 0.03}
+TOLERANCE |= {"pos": 2e-6, "quat": 2e-6, "lin_vel": 1e-4, "ang_vel": 3e-4}
+
+
+@contextlib.contextmanager
+def no_hang():
+    """A hang of XLA's CPU thread pool ends the test run, where nothing else would."""
+    faulthandler.dump_traceback_later(HANG, exit=True, file=sys.__stderr__)
+    try:
+        yield
+    finally:
+        faulthandler.cancel_dump_traceback_later()
+
+
+def has_gpu() -> bool:
+    return jax.default_backend() == "gpu"
+
+
+@pytest.fixture(scope="module")
+def engine(robot):
+    return MjxEngine(robot, SUBSTEPS)
+
+
+@pytest.fixture(scope="module")
+def step(engine, inputs):
+    """The compiled control step, shared by all tests."""
+    with no_hang():
+        function = jax.jit(engine.step, compiler_options=None if has_gpu() else QUICK_COMPILATION)
+        return function.lower(*inputs).compile()
+
+
+@pytest.fixture(scope="module")
+def result(step, inputs):
+    with no_hang():
+        return jax.block_until_ready(step(*inputs))
+
+
+def assert_same_bits(first, second):
+    for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True):
+        np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
+
+
+def assert_close(name, actual, expected):
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=TOLERANCE[name], err_msg=name)
+
+
+@pytest.mark.parametrize("row", CASES.values(), ids=CASES)
+def test_step_equals_the_native_engines(result, native_result, row):
+    for part, expected in zip(result, native_result, strict=True):
+        for name, values in vars(part).items():
+            assert_close(name, values[row], getattr(expected, name)[row])
+
+
+def test_forward_equals_the_native_engines_and_keeps_other_rows(engine, native, inputs, native_result):
+    mask = jnp.asarray([True, False, True, False, True])
+    old = jax.tree.map(lambda x: x + 1.0, native_result[1])
+    forward = jax.jit(engine.forward, compiler_options=None if has_gpu() else QUICK_COMPILATION)
+    with no_hang():
+        actual = jax.block_until_ready(forward(inputs.state, inputs.parameters, mask, old))
+    expected = native.forward(inputs.state, inputs.parameters, mask, old)
+    for name, values in vars(actual).items():
+        assert_close(name, values, getattr(expected, name))
+    assert not np.any(actual.contact_force[mask])
+    assert_same_bits(*(jax.tree.map(lambda x: x[~mask], bodies) for bodies in (actual, old)))
+
+
+def test_the_state_keeps_its_types(inputs, result):
+    """A weak type or another dtype would compile the training iteration twice."""
+    state = result[0]
+    for before, after in zip(jax.tree.leaves(inputs.state), jax.tree.leaves(state), strict=True):
+        assert after.dtype == before.dtype == jnp.float32
+        assert after.shape == before.shape
+        assert not after.weak_type
+
+
+def test_a_diverged_row_is_not_finite_and_alone(step, inputs, result):
+    state = inputs.state.replace(qvel=inputs.state.qvel.at[FLIGHT, 9].set(jnp.nan))
+    with no_hang():
+        diverged = jax.block_until_ready(step(state, *inputs[1:]))
+    sound = np.delete(np.arange(len(CASES)), FLIGHT)
+    assert_same_bits(*(jax.tree.map(lambda x: x[sound], r) for r in (diverged, result)))
+    assert np.isnan(diverged[0].qpos[FLIGHT]).any()
+
+
+def test_many_steps_on_a_cpu_end(step, inputs, result):
+    """The hang came and went with XLA's defaults: see the flag in the package's __init__."""
+    state = inputs.state
+    with no_hang():
+        for _ in range(20):
+            state, _ = step(state, *inputs[1:])
+        assert np.isfinite(jax.block_until_ready(state).qpos).all()
+        assert_same_bits(step(*inputs), result)
+
+
+def test_only_pairs_of_floor_and_robot_make_contacts(robot, engine):
+    model = robot.model
+    touches = (model.geom_conaffinity != 0) & (np.arange(model.ngeom) != model.geom("floor").id)
+    spheres = int((touches & (model.geom_type == mujoco.mjtGeom.mjGEOM_SPHERE)).sum())
+    capsules = int((touches & (model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE)).sum())
+    assert spheres + capsules == touches.sum()
+    assert engine.num_contacts == spheres + 2 * capsules  # a capsule lies on a plane with both ends
+    assert MjxEngine(load_robot("g1", self_collision=True), SUBSTEPS).num_contacts > engine.num_contacts
+
+
+def test_warp_has_room_for_every_contact_and_joint_limit(robot, engine):
+    rows_of_a_contact = 4  # a pyramid of two tangents
+    assert engine.num_contacts <= WARP_CONTACTS
+    assert rows_of_a_contact * engine.num_contacts + robot.num_joints <= WARP_CONSTRAINTS
+
+
+def test_warp_that_is_not_installed_is_told_in_one_line(robot, monkeypatch):
+    monkeypatch.setattr(mujoco.mjx.warp, "WARP_INSTALLED", False)
+    with pytest.raises(InputError, match=r"mjx-warp.*pip install 'mujoco-mjx\[warp\]'") as error:
+        MjxEngine(robot, SUBSTEPS, implementation="warp")
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.skipif(not (mujoco.mjx.warp.WARP_INSTALLED and has_gpu()), reason="needs warp and a CUDA GPU")
+def test_warp_step_equals_the_native_engines(robot, inputs, native_result):
+    result = jax.jit(MjxEngine(robot, SUBSTEPS, implementation="warp").step)(*inputs)
+    for part, expected in zip(result, native_result, strict=True):
+        for name, values in vars(part).items():
+            assert_close(name, values, getattr(expected, name))
