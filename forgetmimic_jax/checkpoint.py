@@ -1,7 +1,7 @@
 """Checkpoints: orbax trees, the config and a note of what they belong to, in a folder that appears whole or not at all.
 
-`policy/` holds what goes from one run to another (networks, normalisers, failure levels); `run/` all the rest of the
-TrainState, for resuming. A shipped checkpoint may lack `run/`.
+`policy/` holds the networks and their normalisers, `sampler/` the failure levels of the clips' bins: what goes from one
+run to another. `run/` holds all the rest of the TrainState, for resuming; a shipped checkpoint may lack it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from forgetmimic_jax.motion.library import MotionLibrary
 from forgetmimic_jax.robot import Robot
 from forgetmimic_jax.state import Policy, TrainState
 
-POLICY, RUN, CONFIG, META = "policy", "run", "config.yaml", "meta.json"
+POLICY, SAMPLER, RUN, CONFIG, META = "policy", "sampler", "run", "config.yaml", "meta.json"
 SCHEMA = 1
 
 
@@ -68,7 +68,7 @@ def save_checkpoint(
         resumable: with `run/`; without, the checkpoint is small and serves evaluation and warm starts only.
     """
     state = jax.tree.map(np.asarray, state)
-    trees: dict[str, Any] = {POLICY: {"policy": state.policy, "failure_level": state.failure_level}}
+    trees: dict[str, Any] = {POLICY: {"policy": state.policy}, SAMPLER: {"failure_level": state.failure_level}}
     if resumable:
         trees[RUN] = _run_part(state)
     meta = {
@@ -121,8 +121,18 @@ def read_info(path: Path) -> CheckpointInfo:
     return CheckpointInfo(path=path, config=load_config(path / CONFIG), **known)
 
 
-def check_matches(info: CheckpointInfo, robot: Robot, library: MotionLibrary, library_hash: str, config: Config) -> None:
+def check_matches(
+    info: CheckpointInfo,
+    robot: Robot,
+    library: MotionLibrary,
+    library_hash: str,
+    config: Config,
+    *,
+    other_library: bool = False,
+) -> None:
     """Say which of robot, joints, library or network differs between a checkpoint and what is asked.
+
+    `other_library` accepts other clips: a policy may be trained on with them.
 
     Raises:
         InputError: something differs.
@@ -130,7 +140,7 @@ def check_matches(info: CheckpointInfo, robot: Robot, library: MotionLibrary, li
     if info.robot != robot.name or info.joints != robot.joint_names:
         raise InputError(f"{info.path}: robot: the checkpoint's is '{info.robot}' ({len(info.joints)} joints), asked "
                          f"for '{robot.name}' ({robot.num_joints} joints)")  # fmt: skip
-    if info.clips != library.names or info.library_hash != library_hash:
+    if not other_library and (info.clips != library.names or info.library_hash != library_hash):
         missing, added = set(info.clips) - set(library.names), set(library.names) - set(info.clips)
         difference = "; ".join(
             part
@@ -150,20 +160,25 @@ def check_matches(info: CheckpointInfo, robot: Robot, library: MotionLibrary, li
             raise InputError(f"{info.path}: ppo.{field}: the checkpoint's is {list(theirs)}, asked for {list(ours)}")
 
 
-def load_policy(path: Path, template: TrainState) -> tuple[Policy, Array]:
-    """Policy and failure levels of a checkpoint; `template` gives the shapes (`jax.eval_shape` of `init_state`)."""
+def load_policy(path: Path, template: TrainState) -> Policy:
+    """A checkpoint's networks and normalisers; `template` gives the shapes (`jax.eval_shape` of `init_state`)."""
     with _explained(path):
-        tree = _restore(path / POLICY, {"policy": template.policy, "failure_level": template.failure_level})
-        return tree["policy"], tree["failure_level"]
+        return _restore(path / POLICY, {"policy": template.policy})["policy"]
+
+
+def load_failure_level(path: Path, template: TrainState) -> Array:
+    """A checkpoint's failure levels L [clip, bin]."""
+    with _explained(path):
+        return _restore(path / SAMPLER, {"failure_level": template.failure_level})["failure_level"]
 
 
 def load_state(path: Path, template: TrainState) -> TrainState:
     """The whole TrainState of a resumable checkpoint."""
     if not (path / RUN).is_dir():
         raise InputError(f"{path}: holds a policy but no {RUN}/ to resume from; start a new run with --base {path}")
+    policy, failure_level = load_policy(path, template), load_failure_level(path, template)
     with _explained(path):
-        policy = _restore(path / POLICY, {"policy": template.policy, "failure_level": template.failure_level})
-        return template.replace(**policy, **_restore(path / RUN, _run_part(template)))
+        return TrainState(policy=policy, failure_level=failure_level, **_restore(path / RUN, _run_part(template)))
 
 
 def newest_checkpoint(directory: Path) -> Path | None:

@@ -18,7 +18,7 @@ from forgetmimic_jax import checkpoint
 from forgetmimic_jax.config import Config, save_config
 from forgetmimic_jax.console import progress
 from forgetmimic_jax.errors import InputError, nearest
-from forgetmimic_jax.motion.library import DATA_DIR, MotionLibrary, library_hash, load_library
+from forgetmimic_jax.motion.library import DATA_DIR, MotionLibrary, library_hash, load_library, read_manifest
 from forgetmimic_jax.ppo.update import make_iteration
 from forgetmimic_jax.robot import Robot, load_robot
 from forgetmimic_jax.state import TrainState, init_state
@@ -49,7 +49,7 @@ def make_setup(config: Config) -> Setup:
         line_search_iterations=config.physics.line_search_iterations,
         self_collision=config.physics.self_collision,
     )
-    folder = DATA_DIR / robot.name if config.library is None else Path(config.library)
+    folder = library_folder(config)
     library = load_library(robot, folder)
     check_targets(config.unlearn.targets, library.names)
     env = make_environment(config, robot, config.ppo.num_envs)
@@ -62,15 +62,23 @@ def template(setup: Setup) -> TrainState:
 
 
 def start_state(setup: Setup, base: Path | None) -> TrainState:
-    """A fresh run's state; with `base` a warm start from that checkpoint's policy."""
+    """A fresh run's state; with `base` a warm start from that checkpoint's policy.
+
+    Training may go on with other clips than the base's; unlearning needs the base's own.
+    """
     key = jax.random.PRNGKey(setup.config.seed)
     if base is None:
         return jax.jit(lambda assets, key: init_state(setup.env, assets, key))(setup.assets, key)
     info = checkpoint.read_info(base)
-    checkpoint.check_matches(info, setup.robot, setup.library, setup.library_hash, setup.config)
-    policy, failure = checkpoint.load_policy(base, template(setup))
-    start = jax.jit(lambda assets, key, policy, failure: init_state(setup.env, assets, key, policy, failure))
-    return start(setup.assets, key, policy, failure if setup.config.sampling.rule == "frozen" else None)
+    unlearning = bool(setup.config.unlearn.targets)
+    checkpoint.check_matches(
+        info, setup.robot, setup.library, setup.library_hash, setup.config, other_library=not unlearning
+    )
+    shapes = template(setup)
+    policy = checkpoint.load_policy(base, shapes)
+    failure_level = checkpoint.load_failure_level(base, shapes) if setup.config.sampling.rule == "frozen" else None
+    start = jax.jit(lambda assets, key, policy, level: init_state(setup.env, assets, key, policy, level))
+    return start(setup.assets, key, policy, failure_level)
 
 
 def check_targets(targets: tuple[str, ...], names: tuple[str, ...]) -> None:
@@ -84,6 +92,29 @@ def check_targets(targets: tuple[str, ...], names: tuple[str, ...]) -> None:
             raise InputError(f"targets: no clip '{target}' in the library; {nearest(target, names)}")
     if targets and set(targets) == set(names):
         raise InputError(f"targets: all {len(names)} clips of the library; leave at least one to keep")
+
+
+def library_folder(config: Config) -> Path:
+    """Where a config's clips lie."""
+    return DATA_DIR / config.robot if config.library is None else Path(config.library)
+
+
+def default_targets(config: Config) -> tuple[str, ...]:
+    """The clips that the library itself proposes to forget."""
+    return tuple(read_manifest(library_folder(config)).get("default_targets", ()))
+
+
+def base_folder(robot: str) -> Path:
+    """Where a robot's shipped base policy lies."""
+    return DATA_DIR / robot / "base"
+
+
+def default_folder(kind: str, *, resume: bool) -> Path:
+    """The next free folder runs/KIND-NUMBER, or with `resume` the last one."""
+    numbers = [int(path.name.rpartition("-")[2]) for path in Path("runs").glob(f"{kind}-[0-9]*")
+               if path.name.rpartition("-")[2].isdigit()]  # fmt: skip
+    last = max(numbers, default=0)
+    return Path("runs") / f"{kind}-{last if resume and last else last + 1:03d}"
 
 
 def prepare_folder(directory: Path, *, resume: bool) -> Path | None:

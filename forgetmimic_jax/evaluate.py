@@ -1,0 +1,92 @@
+"""Evaluate a checkpoint clip by clip: `python -m forgetmimic_jax.evaluate --robot g1`."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from forgetmimic_jax.errors import run_command
+
+
+@dataclass
+class Options:
+    """Roll a policy out on every clip, deterministic and unassisted, beside the zero-action floor."""
+
+    robot: str = "g1"
+    """Robot under robots/."""
+    checkpoint: Path | None = None
+    """Checkpoint folder; the shipped base data/ROBOT/base by default."""
+    base: Path | None = None
+    """For an unlearned checkpoint, the base to compare with; the one it started from by default."""
+    targets: str | None = None
+    """Clips that count as forgotten, comma-separated; by default those the checkpoint was told to forget."""
+    episodes: int = 20
+    """Episodes a clip: half from frame 0, half spread over the clip."""
+    seed: int = 0
+    """Seed of start frames and reset noise; the same for every policy."""
+    physics: Literal["auto", "native", "mjx", "mjx-warp"] | None = None
+    """Physics engine; auto is native on a CPU and mjx on a GPU or TPU."""
+    library: Path | None = None
+    """Folder of clips; the checkpoint's by default."""
+    output: Path | None = None
+    """Folder for evaluation.json, .md and .png; beside the checkpoints of the run, or runs/evaluate-ROBOT."""
+
+
+def main(options: Options) -> None:
+    """Evaluate, write the files and print the table."""
+    from forgetmimic_jax import checkpoint, runner
+    from forgetmimic_jax.console import closing
+    from forgetmimic_jax.errors import InputError
+    from forgetmimic_jax.evaluation.evaluate import cost, evaluate, show_and_write
+    from forgetmimic_jax.options import comma_separated
+
+    if options.episodes < 1:
+        raise InputError(f"--episodes: found {options.episodes}; at least 1 is needed")
+    path = options.checkpoint or runner.base_folder(options.robot)
+    info = checkpoint.read_info(path)
+    config = dataclasses.replace(info.config, robot=options.robot)
+    if options.library:
+        config = dataclasses.replace(config, library=str(options.library))
+    if options.physics:
+        config = dataclasses.replace(config, physics=dataclasses.replace(config.physics, engine=options.physics))
+    setup = runner.make_setup(config)
+    checkpoint.check_matches(info, setup.robot, setup.library, setup.library_hash, config)
+    targets = info.config.unlearn.targets if options.targets is None else comma_separated(options.targets)
+    runner.check_targets(targets, setup.library.names)
+    shapes = runner.template(setup)
+    name = "unlearned" if info.config.unlearn.targets else "base"
+    policies = {name: checkpoint.load_policy(path, shapes)}
+    budget = {name: cost(info)}
+    if name == "unlearned":
+        base = options.base or runner.base_folder(options.robot)
+        base_info = checkpoint.read_info(base)
+        checkpoint.check_matches(base_info, setup.robot, setup.library, setup.library_hash, config)
+        policies = {"base": checkpoint.load_policy(base, shapes), **policies}
+        budget["base"] = cost(base_info)
+    document = evaluate(
+        config,
+        setup.robot,
+        setup.library,
+        setup.library_hash,
+        policies,
+        checkpoint=str(path),
+        targets=targets,
+        episodes=options.episodes,
+        seed=options.seed,
+        budget=budget,
+    )
+    if options.output:
+        output = options.output
+    elif path.parent.name == "checkpoints":
+        output = path.parent.parent
+    else:
+        output = Path("runs") / f"evaluate-{options.robot}"
+    closing(show_and_write(output, document), f"make unlearn ROBOT={options.robot}")
+
+
+if __name__ == "__main__":
+    run_command(lambda: main(tyro.cli(Options)))
