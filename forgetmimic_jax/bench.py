@@ -1,0 +1,156 @@
+"""Where the time goes on this machine: `python -m forgetmimic_jax.bench`. Ratios within one run, nothing absolute."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import resource
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from forgetmimic_jax.errors import run_command
+
+
+@dataclass
+class Options:
+    """Time the environment against raw MuJoCo stepping of the same states, and the parts of a PPO iteration."""
+
+    robot: str = "g1"
+    """Robot under robots/."""
+    preset: Literal["cpu", "paper"] = "cpu"
+    """Settings."""
+    physics: Literal["auto", "native", "mjx", "mjx-warp"] | None = None
+    """Physics engine; auto is native on a CPU and mjx on a GPU or TPU."""
+    library: Path | None = None
+    """Folder of clips; data/ROBOT by default."""
+    repeats: int = 7
+    """Times each measurement is taken; the median counts, rounds of all measurements alternate."""
+    output: Path | None = None
+    """JSON file for the figures; only printed by default."""
+
+
+def main(options: Options) -> None:
+    """Measure and print a table."""
+    started = time.perf_counter()
+    import jax
+    import jax.numpy as jnp
+    from rich.console import Console
+    from rich.table import Table
+
+    from forgetmimic_jax import runner
+    from forgetmimic_jax.config import preset
+    from forgetmimic_jax.options import replace_given
+    from forgetmimic_jax.physics.engine import resolve_engine
+    from forgetmimic_jax.ppo.update import collect, make_iteration
+    from forgetmimic_jax.tracking import env as tracking
+    from forgetmimic_jax.tracking.rsi import bin_probabilities
+
+    config = replace_given(preset(options.preset), robot=options.robot, library=options.library and str(options.library))
+    if options.physics:
+        config = dataclasses.replace(config, physics=dataclasses.replace(config.physics, engine=options.physics))
+    setup = runner.make_setup(config)
+    env, assets, steps = setup.env, setup.assets, config.ppo.num_steps
+    state = runner.start_state(setup, None)
+    first_iteration = make_iteration(env)
+    state, _ = jax.block_until_ready(first_iteration(assets, state))
+    to_first_step = time.perf_counter() - started
+    probabilities = bin_probabilities(config.sampling, assets.bins, state.failure_level)
+    gains = jnp.zeros_like(probabilities)
+
+    @jax.jit
+    def environment(assets, episodes, key):
+        def one_step(episodes, key):
+            action_key, step_key, reset_key, observe_key = jax.random.split(key, 4)
+            action = config.ppo.initial_std * jax.random.normal(action_key, (env.num_envs, env.robot.num_joints))
+            after, result = tracking.step(env, assets, episodes, action, step_key)
+            done = result.terminated | result.truncated
+            fresh = tracking.reset_where(env, assets, after, done, reset_key, probabilities, gains)
+            observation = tracking.observe(env, assets, fresh, observe_key)
+            target = tracking.lookup(assets.library, episodes.clip, episodes.frame + 1).joint_pos
+            target += assets.robot.action_scale * action
+            return fresh, (episodes.physics, target, observation[0].sum(), result.reward.tracking.sum())
+
+        return jax.lax.scan(one_step, episodes, jax.random.split(key, steps))
+
+    collect_only = jax.jit(lambda assets, state: collect(env, assets, state))
+    _, (physics, targets, *_) = jax.block_until_ready(environment(assets, state.env, jax.random.PRNGKey(1)))
+    jax.block_until_ready(collect_only(assets, state))
+    raw = _raw_stepping(setup.robot.model, env.num_envs, config.physics.substeps, physics, targets)
+
+    measured: dict[str, list[float]] = {"raw": [], "environment": [], "collect": [], "iteration": []}
+    for repeat in range(options.repeats):
+        measured["raw"].append(raw())
+        measured["environment"].append(_timed(lambda r=repeat: environment(assets, state.env, jax.random.PRNGKey(r))))
+        measured["collect"].append(_timed(lambda: collect_only(assets, state)))
+        begin = time.perf_counter()
+        state, _ = jax.block_until_ready(first_iteration(assets, state))
+        measured["iteration"].append(time.perf_counter() - begin)
+    median = {name: statistics.median(values) for name, values in measured.items()}
+    env_steps = env.num_envs * steps
+    figures = {
+        "engine": resolve_engine(config.physics.engine),
+        "cores": os.cpu_count(),
+        "environments": env.num_envs,
+        "raw_control_steps_per_second": env_steps / median["raw"],
+        "environment_control_steps_per_second": env_steps / median["environment"],
+        "environment_over_raw": median["raw"] / median["environment"],
+        "iteration_control_steps_per_second": env_steps / median["iteration"],
+        "iteration_beyond_simulation_over_simulation": (median["iteration"] - median["raw"]) / median["raw"],
+        "share_physics": median["raw"] / median["iteration"],
+        "share_environment": (median["environment"] - median["raw"]) / median["iteration"],
+        "share_policy_in_rollout": (median["collect"] - median["environment"]) / median["iteration"],
+        "share_update": (median["iteration"] - median["collect"]) / median["iteration"],
+        "seconds_to_first_iteration": to_first_step,
+        "peak_memory_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**30 if sys.platform == "darwin" else 2**20),
+    }  # fmt: skip
+    table = Table(title=f"{config.robot}, preset {config.preset}, {figures['engine']} engine", title_justify="left")
+    table.add_column("figure")
+    table.add_column("value", justify="right")
+    for name, value in figures.items():
+        table.add_row(name.replace("_", " "), f"{value:,.2f}" if isinstance(value, float) else str(value))
+    Console().print(table)
+    if options.output:
+        options.output.parent.mkdir(parents=True, exist_ok=True)
+        options.output.write_text(json.dumps(figures, indent=2) + "\n")
+        print(f"figures  {options.output}")
+
+
+def _raw_stepping(model, num_envs: int, substeps: int, physics, targets) -> Callable[[], float]:
+    """Seconds that plain `mujoco.batch` needs for the same states and targets; loading them is not counted."""
+    import mujoco
+    import mujoco.batch
+    import numpy as np
+
+    batch = mujoco.batch.Batch(model, num_envs)
+    rows = [np.asarray(x, np.float64) for x in (physics.qpos, physics.qvel, physics.warmstart, targets)]
+
+    def run() -> float:
+        seconds = 0.0
+        for qpos, qvel, warmstart, target in zip(*rows, strict=True):
+            batch.qpos[:], batch.qvel[:], batch.qacc_warmstart[:], batch.ctrl[:] = qpos, qvel, warmstart, target
+            begin = time.perf_counter()
+            batch.step(nstep=substeps, stage=int(mujoco.mjtStage.mjSTAGE_VEL))
+            seconds += time.perf_counter() - begin
+        return seconds
+
+    return run
+
+
+def _timed(function: Callable[[], object]) -> float:
+    import jax
+
+    begin = time.perf_counter()
+    jax.block_until_ready(function())
+    return time.perf_counter() - begin
+
+
+if __name__ == "__main__":
+    run_command(lambda: main(tyro.cli(Options)))
