@@ -43,6 +43,7 @@ class NativeEngine:
         self._anchor = robot.anchor_body_id
         self._torso_com = model.body_ipos[self._anchor].copy()
         self._feet = robot.foot_geom_ids
+        self._everyone = np.arange(num_envs)
         self._contact_columns = contact_sensor_columns(robot)
         self._outputs = {
             name: self._batch.bind(name) for name in ("xpos", "xquat", "cvel", "subtree_com", "sensordata")
@@ -80,40 +81,39 @@ class NativeEngine:
         fresh = body_state(xpos, xquat, cvel, com, jnp.zeros_like(bodies.contact_force))
         return select_rows(mask, fresh, bodies)
 
-    def _load(self, qpos, qvel, warmstart, friction, torso_com) -> None:
+    def _load(self, rows, qpos, qvel, warmstart, friction, torso_com) -> None:
         batch = self._batch
-        batch.qpos[:] = qpos
-        batch.qvel[:] = qvel
-        batch.qacc_warmstart[:] = warmstart
-        self._friction[:, self._feet, 0] = np.asarray(friction)[:, None]
-        self._body_ipos[:, self._anchor] = self._torso_com + np.asarray(torso_com)
+        batch.qpos[rows] = qpos[rows]
+        batch.qvel[rows] = qvel[rows]
+        batch.qacc_warmstart[rows] = warmstart[rows]
+        self._friction[rows[:, None], self._feet, 0] = friction[rows, None]
+        self._body_ipos[rows, self._anchor] = self._torso_com + torso_com[rows]
 
-    def _bodies(self) -> tuple[np.ndarray, ...]:
-        out = self._outputs
-        return (
-            out["xpos"][:, self._keys].astype(np.float32),
-            out["xquat"][:, self._keys].astype(np.float32),
-            out["cvel"][:, self._keys].astype(np.float32),
-            out["subtree_com"][:, 1].astype(np.float32),
-        )
+    def _bodies(self, rows) -> tuple[np.ndarray, ...]:
+        """Key-body fields of `rows`; the other rows are zero."""
+        fields = (("xpos", self._keys), ("xquat", self._keys), ("cvel", self._keys), ("subtree_com", 1))
+        arrays = tuple(np.zeros(shape.shape, np.float32) for shape in self._body_shapes)
+        for array, (name, columns) in zip(arrays, fields, strict=True):
+            array[rows] = self._outputs[name][rows][:, columns]
+        return arrays
 
     def _step_host(self, arguments) -> tuple[np.ndarray, ...]:
-        qpos, qvel, warmstart, friction, torso_com, target, wrench = arguments
+        *state, friction, torso_com, target, wrench = (np.asarray(x) for x in arguments)
         with self._lock:
             batch = self._batch
-            self._load(qpos, qvel, warmstart, friction, torso_com)
+            self._load(self._everyone, *state, friction, torso_com)
             batch.ctrl[:] = target
             batch.xfrc_applied[:, self._anchor] = wrench
             batch.step(nstep=self._substeps, stage=_VELOCITY_STAGE)
             force = -self._outputs["sensordata"][:, self._contact_columns].astype(np.float32)
-            state = tuple(x.astype(np.float32) for x in (batch.qpos, batch.qvel, batch.qacc_warmstart))
-            return (*state, *self._bodies(), force)
+            new = tuple(x.astype(np.float32) for x in (batch.qpos, batch.qvel, batch.qacc_warmstart))
+            return (*new, *self._bodies(self._everyone), force)
 
     def _forward_host(self, arguments) -> tuple[np.ndarray, ...]:
-        qpos, qvel, warmstart, friction, torso_com, mask = arguments
+        *state, friction, torso_com, mask = (np.asarray(x) for x in arguments)
         with self._lock:
-            ids = np.flatnonzero(np.asarray(mask))
-            if ids.size:
-                self._load(qpos, qvel, warmstart, friction, torso_com)
-                self._batch.forward(ids=ids.astype(np.int32), stage=_VELOCITY_STAGE)
-            return self._bodies()
+            rows = np.flatnonzero(mask)
+            if rows.size:
+                self._load(rows, *state, friction, torso_com)
+                self._batch.forward(ids=rows.astype(np.int32), stage=_VELOCITY_STAGE)
+            return self._bodies(rows)

@@ -68,7 +68,10 @@ def bin_probabilities(config: SamplingConfig, bins: Bins, failure_level: Array) 
 def sample_start(key: Array, probabilities: Array, bins: Bins, num: int) -> tuple[Array, Array, Array]:
     """Clip, bin and frame, each i32[num]."""
     bin_key, frame_key = jax.random.split(key)
-    flat = jax.random.categorical(bin_key, jnp.log(probabilities.reshape(-1)), shape=(num,))
+    # By the inverse of the cumulative distribution: one uniform number a draw, where Gumbel's trick needs one a bin.
+    cumulative = jnp.cumsum(probabilities.reshape(-1))
+    drawn = jax.random.uniform(bin_key, (num,)) * cumulative[-1]
+    flat = jnp.searchsorted(cumulative, drawn, side="right")
     clip, index = jnp.divmod(flat, probabilities.shape[1])
     frame = jax.random.randint(frame_key, (num,), bins.start[clip, index], bins.end[clip, index])
     return clip.astype(jnp.int32), index.astype(jnp.int32), frame.astype(jnp.int32)
