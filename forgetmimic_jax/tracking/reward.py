@@ -64,21 +64,19 @@ def tracking_errors(reference: Reference, aligned: AlignedBodies, bodies: BodySt
         joint_pos: [env, joint] rad.
         joint_vel: [env, joint] rad/s.
     """
-    ref_quat, quat = reference.body_quat[:, anchor], bodies.quat[:, anchor]
-
-    def in_anchor_frame(reference_vector: Array, vector: Array) -> Array:
-        return rotation.rotate_inverse(ref_quat, reference_vector[:, anchor]) - rotation.rotate_inverse(
-            quat, vector[:, anchor]
-        )
 
     def squared(error: Array) -> Array:
         return jnp.sum(error**2, axis=-1)
 
+    def of_anchor(error: Array) -> Array:
+        return squared(error[:, anchor])
+
     return {
-        "root_position": squared(reference.body_pos[:, anchor] - bodies.pos[:, anchor]),
-        "root_orientation": rotation.angle_between(ref_quat, quat) ** 2,
-        "root_linear_velocity": squared(in_anchor_frame(reference.body_lin_vel, bodies.lin_vel)),
-        "root_angular_velocity": squared(in_anchor_frame(reference.body_ang_vel, bodies.ang_vel)),
+        "root_position": of_anchor(reference.body_pos - bodies.pos),
+        "root_orientation": rotation.angle_between(reference.body_quat[:, anchor], bodies.quat[:, anchor]) ** 2,
+        # "Body frame" in the paper is the robot's for both sides, which leaves the norm of the world-frame difference.
+        "root_linear_velocity": of_anchor(reference.body_lin_vel - bodies.lin_vel),
+        "root_angular_velocity": of_anchor(reference.body_ang_vel - bodies.ang_vel),
         "body_position": squared(aligned.pos - bodies.pos).mean(-1),
         "body_orientation": (rotation.angle_between(aligned.quat, bodies.quat) ** 2).mean(-1),
         "body_linear_velocity": squared(aligned.lin_vel - bodies.lin_vel).mean(-1),
