@@ -119,7 +119,7 @@ def regularisation_reward(
     """
     torque = jnp.clip(robot.stiffness * (target - joint_pos) - robot.damping * joint_vel, -robot.effort, robot.effort)
     over_limit = jnp.maximum(robot.soft_lower - joint_pos, 0.0) + jnp.maximum(joint_pos - robot.soft_upper, 0.0)
-    over_torque = jnp.maximum(jnp.abs(torque) - config.torque_soft_ratio * robot.effort, 0.0)
+    over_torque = jnp.maximum(jnp.abs(torque) / robot.effort - config.torque_soft_ratio, 0.0)
     return (
         config.survival
         + config.action_rate_l1 * jnp.abs(action - last_action).sum(-1)
