@@ -23,8 +23,8 @@ def reference_wrench(
     """Force and torque [env, 6] (N, N m; world frame) that would carry the anchor along the reference.
 
     F = M (a_ref + k_p e_p + k_d e_v − g); τ = I_w (α_ref + k_R e_R + k_ω e_ω) + ω × I_w ω, with I_w the robot's
-    inertia turned to the world by the anchor. `law="wbc"` leaves M and I_w off the gain and gravity terms, as
-    wbc-mjlab's code does.
+    inertia turned to the world by the anchor. `law="wbc"` leaves M off the gain and gravity terms of the force, as
+    wbc-mjlab's code does; its torque is the same.
     """
     quat, ang_vel = bodies.quat[:, anchor], bodies.ang_vel[:, anchor]
     position_pull = config.position_stiffness * (reference.body_pos[:, anchor] - bodies.pos[:, anchor])
@@ -35,11 +35,9 @@ def reference_wrench(
     def inertia(vector: Array) -> Array:
         return rotation.rotate(quat, rotation.rotate_inverse(quat, vector) @ robot.inertia.T)
 
-    gyroscopic = jnp.cross(ang_vel, inertia(ang_vel))
+    torque = inertia(reference.anchor_ang_acc + orientation_pull) + jnp.cross(ang_vel, inertia(ang_vel))
     if config.law == "wbc":
         force = robot.mass * reference.anchor_lin_acc + position_pull - robot.gravity
-        torque = inertia(reference.anchor_ang_acc) + orientation_pull + gyroscopic
     else:
         force = robot.mass * (reference.anchor_lin_acc + position_pull - robot.gravity)
-        torque = inertia(reference.anchor_ang_acc + orientation_pull) + gyroscopic
     return jnp.concatenate([force, torque], axis=-1)
