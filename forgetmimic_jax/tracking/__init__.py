@@ -1,1 +1,1 @@
-"""The motion-tracking task: reference, observation, reward, termination, sampling, wrench, randomisation, environment."""
+"""The tracking task: reference, observation, reward, termination, sampling, wrench, randomisation, environment."""

@@ -6,10 +6,12 @@ apart lets training bootstrap the value of a truncated episode's last state, and
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
+import mujoco
 from flax import struct
 from jax import Array
 
@@ -61,7 +63,7 @@ class StepResult:
     reward: reward.Reward
     terminated: Array  # bool: a bound was broken, or the physics diverged
     truncated: Array  # bool: the clip or the time ended
-    diverged: Array  # bool: NaN or Inf in the physics
+    diverged: Array  # bool: NaN, Inf or absurd numbers in the physics
     causes: dict[str, Array]  # bool, which bound
     reference: Reference  # the frame that was tracked
 
@@ -141,7 +143,8 @@ def start_episodes(
 
 def refresh_bodies(env: Environment, state: EnvState, mask: Array) -> EnvState:
     """Key bodies by forward kinematics where mask [env]: a reset's noise moved them off the reference."""
-    return state.replace(bodies=env.engine.forward(state.physics, state.parameters, mask, state.bodies))
+    bodies = env.engine.forward(state.physics, state.parameters, mask, state.bodies)
+    return dataclasses.replace(state, bodies=bodies)
 
 
 def reset_where(
@@ -181,13 +184,13 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
     if env.noisy:
         push_key, interval_key = jax.random.split(key)
         due = countdown <= 0
-        pushed = randomise.push(config.noise, push_key, physics.qvel)
-        physics = physics.replace(qvel=jnp.where(due[:, None], pushed, physics.qvel))
+        pushed = randomise.push(config.noise, push_key, physics)
+        physics = dataclasses.replace(physics, qvel=jnp.where(due[:, None], pushed, physics.qvel))
         interval = randomise.push_interval(config.noise, interval_key, env.num_envs, env.control_step)
-        countdown = jnp.where(due, interval, countdown - 1)
+        countdown = jnp.where(due, interval, countdown) - 1
 
     physics, bodies = env.engine.step(physics, state.parameters, target, wrench)
-    diverged = ~_all_finite((physics, bodies), env.num_envs)
+    diverged = ~_all_sane((physics, bodies), env.num_envs)
     # A diverged robot shows as standing where it was, so that no NaN can reach a sum; it is reset right after.
     physics, bodies = (_where(diverged, old, new) for old, new in ((state.physics, physics), (state.bodies, bodies)))
 
@@ -205,17 +208,16 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
         joint_acc=physics.warmstart[:, 6:],
         target=target,
     )
-    alive = ~diverged
-    result_reward = reward.Reward(
-        tracking=tracking * alive,
-        regularisation=regularisation * alive,
-        normalized_tracking=normalized * alive,
-        terms={name: term * alive for name, term in terms.items()},
+    # Where, not a product: a number that overflowed before the divergence was seen would survive a factor of zero.
+    result_reward = jax.tree.map(
+        lambda value: jnp.where(diverged, 0.0, value), reward.Reward(tracking, regularisation, normalized, terms)
     )
-    causes = terminations(config.termination, reference, aligned, bodies, robot.anchor, jnp.asarray(robot.end_effectors))
+    end_effectors = jnp.asarray(robot.end_effectors)
+    causes = terminations(config.termination, reference, aligned, bodies, robot.anchor, end_effectors)
     terminated = diverged | jnp.stack(list(causes.values())).any(0)
     steps = state.step + 1
-    new = state.replace(
+    new = dataclasses.replace(
+        state,
         physics=physics,
         bodies=bodies,
         frame=state.frame + 1,
@@ -223,7 +225,7 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
         tracking_sum=state.tracking_sum + result_reward.normalized_tracking,
         last_action=action,
         push_countdown=countdown,
-        terms=jnp.stack(list(terms.values()), axis=-1),
+        terms=jnp.stack(list(result_reward.terms.values()), axis=-1),
     )
     truncated = (steps >= state.horizon) & ~terminated
     return new, StepResult(result_reward, terminated, truncated, diverged, causes, reference)
@@ -233,9 +235,7 @@ def observe(env: Environment, assets: Assets, state: EnvState, key: Array | None
     """Actor observation [env, 16 + 4 joint] and critic observation [env, features]; noise on the actor's with a key."""
     robot = env.robot
     reference = lookup(assets.library, state.clip, state.frame + 1)
-    clean = observation.actor_observation(
-        assets.robot, reference, robot.root, state.physics, state.last_action
-    )
+    clean = observation.actor_observation(assets.robot, reference, robot.root, state.physics, state.last_action)
     wrench = assist(env, assets, state) if env.config.wrench.max_gain > 0 else jnp.zeros((env.num_envs, 6), jnp.float32)
     critic = observation.critic_observation(
         clean,
@@ -256,9 +256,10 @@ def observe(env: Environment, assets: Assets, state: EnvState, key: Array | None
     return clean + noise + bias, critic
 
 
-def _all_finite(tree, num_envs: int) -> Array:
-    """bool[env]: every number of the environment is finite."""
-    return jnp.stack([jnp.isfinite(leaf).reshape(num_envs, -1).all(-1) for leaf in jax.tree.leaves(tree)]).all(0)
+def _all_sane(tree, num_envs: int) -> Array:
+    """bool[env]: no number of the environment is NaN or beyond MuJoCo's bound, above which it too calls it diverged."""
+    sane = [(jnp.abs(leaf) < mujoco.mjMAXVAL).reshape(num_envs, -1).all(-1) for leaf in jax.tree.leaves(tree)]
+    return jnp.stack(sane).all(0)
 
 
 def _where(mask: Array, on_true, on_false):

@@ -40,12 +40,14 @@ def reset_state(config: NoiseConfig, robot: RobotArrays, reference: Reference, r
     )
 
 
-def push(config: NoiseConfig, key: Array, qvel: Array) -> Array:
-    """qvel [env, 6 + joint] after a random change of the base's velocity in the reset ranges."""
+def push(config: NoiseConfig, key: Array, state: PhysicsState) -> Array:
+    """qvel [env, 6 + joint] after a random change of the base's velocity in the reset ranges, world frame."""
     linear_key, angular_key = jax.random.split(key)
-    linear = symmetric(linear_key, len(qvel), config.reset_linear_velocity)
-    angular = symmetric(angular_key, len(qvel), config.reset_angular_velocity)
-    return qvel.at[:, :6].add(jnp.concatenate([linear, angular], axis=-1))
+    num_envs = len(state.qvel)
+    linear = symmetric(linear_key, num_envs, config.reset_linear_velocity)
+    angular = symmetric(angular_key, num_envs, config.reset_angular_velocity)
+    angular = rotation.rotate_inverse(state.qpos[:, 3:7], angular)
+    return state.qvel.at[:, :6].add(jnp.concatenate([linear, angular], axis=-1))
 
 
 def push_interval(config: NoiseConfig, key: Array, num_envs: int, control_step: float) -> Array:
