@@ -1,4 +1,4 @@
-"""TrainState: the one pytree that holds everything a run can change. Saved and restored, a run goes on as if unbroken."""
+"""TrainState: the one pytree that holds all that a run can change. Saved and restored, a run goes on as if unbroken."""
 
 from __future__ import annotations
 

@@ -8,7 +8,13 @@ from jax import Array
 
 
 def generalized_advantages(
-    reward: Array, value: Array, next_value: Array, terminated: Array, truncated: Array, discount: float, gae_lambda: float
+    reward: Array,
+    value: Array,
+    next_value: Array,
+    terminated: Array,
+    truncated: Array,
+    discount: float,
+    gae_lambda: float,
 ) -> tuple[Array, Array]:
     """Advantages and value targets, each [time, env] (Schulman et al. 2016, equation 16).
 
@@ -16,13 +22,13 @@ def generalized_advantages(
         reward: [time, env].
         value: [time, env] V(s_t).
         next_value: [time, env] V of the state that followed s_t before any reset.
-        terminated: [time, env] no value follows.
-        truncated: [time, env] the episode ends here but the value of its last state follows.
+        terminated: bool[time, env] no value follows.
+        truncated: bool[time, env] the episode ends here but the value of its last state follows.
         discount: γ.
         gae_lambda: λ.
     """
-    delta = reward + discount * next_value * (1.0 - terminated) - value
-    carry_on = 1.0 - jnp.maximum(terminated, truncated).astype(reward.dtype)
+    delta = reward + discount * jnp.where(terminated, 0.0, next_value) - value
+    carry_on = 1.0 - (terminated | truncated).astype(reward.dtype)
 
     def backward(advantage: Array, inputs: tuple[Array, Array]) -> tuple[Array, Array]:
         delta, carry_on = inputs

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -48,6 +50,18 @@ class Critic(nn.Module):
     @nn.compact
     def __call__(self, observation: Array) -> Array:
         return MLP(self.layers, 1, output_scale=1.0)(observation)[..., 0]
+
+
+def distribution(actor: Actor, parameters: Any, observation: Array) -> tuple[Array, Array]:
+    """Mean action [..., joint] and log standard deviation [joint] at a normalised observation [..., features]."""
+    mean_and_log_std: Any = actor.apply(parameters, observation)
+    return mean_and_log_std
+
+
+def value(critic: Critic, parameters: Any, observation: Array) -> Array:
+    """V [...] at a normalised privileged observation [..., features]."""
+    result: Any = critic.apply(parameters, observation)
+    return result
 
 
 def log_prob(action: Array, mean: Array, log_std: Array) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import jax
@@ -11,6 +12,7 @@ from flax import struct
 from jax import Array
 
 from forgetmimic_jax.config import PPOConfig
+from forgetmimic_jax.ppo import network
 from forgetmimic_jax.ppo.gae import generalized_advantages
 from forgetmimic_jax.ppo.loss import adapt_learning_rate, policy_loss, value_loss
 from forgetmimic_jax.ppo.network import entropy, kl_divergence, log_prob, normalize, update_normalizer
@@ -19,7 +21,7 @@ from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.tracking.env import Assets, Environment
 from forgetmimic_jax.tracking.rsi import bin_probabilities, episode_failure, update_failure_level
 from forgetmimic_jax.tracking.wrench import wrench_gain
-from forgetmimic_jax.unlearning.antireward import training_reward
+from forgetmimic_jax.unlearning.antireward import threshold_metrics, training_reward
 
 
 @struct.dataclass
@@ -79,12 +81,12 @@ def collect(env: Environment, assets: Assets, state: TrainState) -> tuple[TrainS
     gains = wrench_gain(config.wrench, state.failure_level)
 
     def value_of(observation: Array) -> Array:
-        return critic.apply(policy.critic, normalize(policy.critic_normalizer, observation))
+        return network.value(critic, policy.critic, normalize(policy.critic_normalizer, observation))
 
     def one_step(carry, key: Array):
         before, actor_obs, critic_obs = carry
         action_key, step_key, reset_key, observe_key = jax.random.split(key, 4)
-        mean, log_std = actor.apply(policy.actor, normalize(policy.actor_normalizer, actor_obs))
+        mean, log_std = network.distribution(actor, policy.actor, normalize(policy.actor_normalizer, actor_obs))
         action = mean + jnp.exp(log_std) * jax.random.normal(action_key, mean.shape)
         after, result = tracking.step(env, assets, before, action, step_key)
         done = result.terminated | result.truncated
@@ -119,7 +121,7 @@ def collect(env: Environment, assets: Assets, state: TrainState) -> tuple[TrainS
     first = tracking.observe(env, assets, state.env, first_key if env.noisy else None)
     keys = jax.random.split(rollout_key, config.ppo.num_steps)
     (episodes, _, _), trajectory = jax.lax.scan(one_step, (state.env, *first), keys)
-    return state.replace(env=episodes, key=key), trajectory
+    return dataclasses.replace(state, env=episodes, key=key), trajectory
 
 
 def improve(
@@ -131,7 +133,7 @@ def improve(
     actor, critic = make_actor(env.config, env.robot.num_joints), make_critic(env.config)
     optimizer = make_optimizer(env.config)
     advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-    old_log_std = actor.apply(policy.actor, trajectory.actor_observation[0, :1])[1]
+    old_log_std = network.distribution(actor, policy.actor, trajectory.actor_observation[0, :1])[1]
     batch = {
         "actor_observation": normalize(policy.actor_normalizer, trajectory.actor_observation),
         "critic_observation": normalize(policy.critic_normalizer, trajectory.critic_observation),
@@ -146,9 +148,10 @@ def improve(
     size = batch["value"].shape[0]
 
     def loss_of(params, data: dict[str, Array]) -> tuple[Array, Metrics]:
-        mean, log_std = actor.apply(params[0], data["actor_observation"])
-        value = critic.apply(params[1], data["critic_observation"])
-        policy_term = policy_loss(log_prob(data["action"], mean, log_std) - data["log_prob"], data["advantage"], config.clip)
+        mean, log_std = network.distribution(actor, params[0], data["actor_observation"])
+        value = network.value(critic, params[1], data["critic_observation"])
+        log_ratio = log_prob(data["action"], mean, log_std) - data["log_prob"]
+        policy_term = policy_loss(log_ratio, data["advantage"], config.clip)
         value_term = value_loss(value, data["value"], data["target"], config.clip if config.clip_value else None)
         entropy_term = entropy(log_std)
         loss = policy_term + config.value_cost * value_term - config.entropy_cost * entropy_term
@@ -186,7 +189,10 @@ def improve(
         actor_normalizer=update_normalizer(policy.actor_normalizer, trajectory.actor_observation),
         critic_normalizer=update_normalizer(policy.critic_normalizer, trajectory.critic_observation),
     )
-    return state.replace(policy=new_policy, optimizer=optimizer_state, learning_rate=learning_rate, key=key), metrics
+    state = dataclasses.replace(
+        state, policy=new_policy, optimizer=optimizer_state, learning_rate=learning_rate, key=key
+    )
+    return state, metrics
 
 
 def learn_sampler(
@@ -202,8 +208,8 @@ def learn_sampler(
     probabilities = bin_probabilities(config.sampling, assets.bins, failure_level)
     metrics = losses | _metrics(env, assets, trajectory, done, probabilities) | {"diverged": diverged}
     metrics["top_bin_probability"] = probabilities.max()
-    state = state.replace(
-        failure_level=failure_level, iteration=state.iteration + 1, diverged=state.diverged + diverged
+    state = dataclasses.replace(
+        state, failure_level=failure_level, iteration=state.iteration + 1, diverged=state.diverged + diverged
     )
     return state, metrics
 
@@ -236,6 +242,4 @@ def _metrics(env: Environment, assets: Assets, trajectory: Trajectory, done: Arr
         "clip/probability": probabilities.sum(-1),
     }
     metrics |= {f"terminated/{name}": value.sum() for name, value in trajectory.causes.items()}
-    from forgetmimic_jax.unlearning.antireward import threshold_metrics
-
     return metrics | threshold_metrics(env.config, assets.is_target, steps, tracking, regularisation, normalized)

@@ -102,7 +102,7 @@ def update_failure_level(
     in episodes does not depend on how many end at once.
 
     Args:
-        config: smoothing α, and the rule: only `adaptive` learns.
+        config: smoothing α, and the rule: `frozen` keeps L; the others learn it, for the wrench too.
         failure_level: L before.
         done: bool[...] where an episode ended.
         failure: f_episode[...].

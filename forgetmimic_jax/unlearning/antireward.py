@@ -53,7 +53,7 @@ def threshold_metrics(
     if not config.unlearn.targets:
         return {}
     weight = total_tracking_weight(config.reward)
-    metrics = {}
+    metrics: dict[str, Array] = {}
     for group, mask in (("target", is_target), ("kept", ~is_target)):
         count = jnp.maximum((steps * mask).sum(), 1)
         mean_tracking, mean_regularisation = (tracking * mask).sum() / count, (regularisation * mask).sum() / count
