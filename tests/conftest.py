@@ -1,0 +1,68 @@
+"""What the tests share: the G1, and two short invented clips, so that no test depends on the shipped data."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from forgetmimic_jax.config import Config, preset
+from forgetmimic_jax.motion.clip import Clip
+from forgetmimic_jax.motion.library import MotionLibrary, build_library
+from forgetmimic_jax.robot import Robot, load_robot
+
+SWAY_FRAMES, TURN_FRAMES = 80, 41
+
+
+def invented_clip(robot: Robot, name: str, frames: int, yaw_rate: float, speed: float) -> Clip:
+    """The default pose with every joint waving by 0.05 rad, the root walking forwards, turning and nodding."""
+    time = np.arange(frames) / 50.0
+    default = np.asarray(robot.arrays.default_joint_pos)
+    phase = np.arange(robot.num_joints)
+    joints = default + 0.05 * np.sin(2.0 * np.pi * time[:, None] + phase)
+    yaw, nod = yaw_rate * time, 0.1 * np.sin(2.0 * np.pi * time)
+    heading = np.cumsum(np.stack([np.cos(yaw), np.sin(yaw)], axis=-1), axis=0) * speed / 50.0
+    height = robot.default_height + 0.01 * np.sin(4.0 * np.pi * time)
+    turns = Rotation.from_euler("ZYX", np.stack([yaw, nod, np.zeros(frames)], axis=-1))
+    return Clip(
+        name=name,
+        fps=50.0,
+        joint_names=robot.joint_names,
+        root_pos=np.concatenate([heading, height[:, None]], axis=-1),
+        root_quat=turns.as_quat(scalar_first=True),
+        joint_pos=joints,
+    )
+
+
+@pytest.fixture(scope="session")
+def robot() -> Robot:
+    return load_robot("g1")
+
+
+@pytest.fixture(scope="session")
+def library(robot) -> MotionLibrary:
+    """`sway`: 80 frames; `turn`: 41 frames."""
+    return build_library(
+        robot,
+        [invented_clip(robot, "sway", SWAY_FRAMES, 0.0, 0.3), invented_clip(robot, "turn", TURN_FRAMES, 1.0, 0.2)],
+    )
+
+
+@pytest.fixture(scope="session")
+def tiny_config() -> Config:
+    """The cpu preset with 8 environments, 4 steps and networks of a few units, on the C engine."""
+    config = preset("cpu")
+    return dataclasses.replace(
+        config,
+        physics=dataclasses.replace(config.physics, engine="native"),
+        sampling=dataclasses.replace(config.sampling, bin_seconds=0.4),
+        ppo=dataclasses.replace(
+            config.ppo,
+            num_envs=8,
+            num_steps=4,
+            epochs=2,
+            minibatches=2,
+            actor_layers=(16, 16),
+            critic_layers=(16,),
+        ),
+    )
