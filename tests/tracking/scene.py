@@ -57,7 +57,7 @@ def turned(bodies: BodyState, yaw: float, shift: tuple[float, float]) -> BodySta
         scalar_first=True
     )
     moved = _float32(
-        pos=vectors(bodies.pos) + [*shift, 0.0],
+        pos=vectors(bodies.pos) + np.array([*shift, 0.0]),
         quat=quat.reshape(bodies.quat.shape),
         lin_vel=vectors(bodies.lin_vel),
         ang_vel=vectors(bodies.ang_vel),
