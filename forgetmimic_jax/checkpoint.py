@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -57,6 +58,8 @@ def save_checkpoint(
 ) -> None:
     """Write a run's state to folder `path`; one of the same name is replaced only once the new one is complete.
 
+    A run that is killed while it saves leaves a hidden folder, which the next save removes.
+
     Args:
         path: the checkpoint's folder.
         state: of the run.
@@ -66,6 +69,9 @@ def save_checkpoint(
         library_hash: of those clips.
         environment_steps: control steps lived so far, all environments together.
         resumable: with `run/`; without, the checkpoint is small and serves evaluation and warm starts only.
+
+    Raises:
+        OSError: the system refused; a full disk, for one. Nothing is left of the attempt.
     """
     state = jax.tree.map(np.asarray, state)
     trees: dict[str, Any] = {POLICY: {"policy": state.policy}, SAMPLER: {"failure_level": state.failure_level}}
@@ -80,10 +86,11 @@ def save_checkpoint(
         "iteration": int(state.iteration),
         "environment_steps": environment_steps,
     }
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    shutil.rmtree(temporary, ignore_errors=True)
-    temporary.mkdir(parents=True)
+    for abandoned in path.parent.glob(".*.tmp"):
+        shutil.rmtree(abandoned, ignore_errors=True)
+    temporary = path.with_name(f".{path.name}.tmp")
     try:
+        temporary.mkdir(parents=True)
         with ocp.StandardCheckpointer() as checkpointer:
             for name, tree in trees.items():
                 checkpointer.save((temporary / name).resolve(), tree)
@@ -92,6 +99,12 @@ def save_checkpoint(
         (temporary / META).write_text(json.dumps(meta, indent=2) + "\n")
         shutil.rmtree(path, ignore_errors=True)
         temporary.rename(path)
+    except ValueError as error:
+        # Tensorstore tells what the system refused inside the text of a ValueError.
+        code = re.search(r"os_error_code='(\d+)'", str(error))
+        if not code:
+            raise
+        raise OSError(int(code[1]), os.strerror(int(code[1])), str(path)) from None
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 

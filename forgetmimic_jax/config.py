@@ -8,8 +8,9 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
@@ -159,6 +160,7 @@ class Config:
     preset: str = "paper"
     robot: str = "g1"
     library: str | None = None  # folder of clips; None: data/ROBOT
+    base: str | None = None  # checkpoint to start from; None: a random policy, or for unlearning the shipped base
     seed: int = 0
     iterations: int = 100_000
     checkpoint_every: int = 500
@@ -205,6 +207,65 @@ def preset(name: str) -> Config:
     raise InputError(f"preset '{name}': {nearest(name, ['paper', 'cpu'])}")
 
 
+_ABOVE_ZERO = {
+    *("physics.timestep", "sampling.bin_seconds", "wrench.sensitivity", "unlearn.penalty"),
+    *("ppo.learning_rate", "ppo.min_learning_rate", "ppo.max_learning_rate", "ppo.target_kl", "ppo.clip"),
+    *("ppo.max_gradient_norm", "ppo.initial_std"),
+}
+_SHARES = {
+    *("reward.torque_soft_ratio", "sampling.smoothing", "sampling.uniform_ratio", "sampling.initial_failure"),
+    *("wrench.max_gain", "ppo.discount", "ppo.gae_lambda"),
+}
+
+
+def validate(config: Config) -> None:
+    """Tell numbers that no run can work with before anything is built.
+
+    A whole number is a count and at least 1, a weight may have any sign, every other number is at least 0.
+
+    Raises:
+        InputError: the setting, what was found and what is accepted.
+    """
+    for name, value in _numbers(to_dict(config)):
+        if name == "seed":
+            good, accepted = 0 <= value < 2**32, "0 to 4294967295"
+        elif isinstance(value, int):
+            smallest = 0 if name == "evaluate_every" else 1
+            good, accepted = value >= smallest, f"{smallest} or more"
+        elif name in _ABOVE_ZERO:
+            good, accepted = 0.0 < value < math.inf, "above 0"
+        elif name in _SHARES:
+            good, accepted = 0.0 <= value <= 1.0, "0 to 1"
+        elif name.startswith("reward."):
+            good, accepted = math.isfinite(value), "any finite number"
+        else:
+            good, accepted = 0.0 <= value < math.inf, "0 or more"
+        if not good:
+            raise InputError(f"{name}: found {value:g}; accepted: {accepted}")
+    for field_ in fields(NoiseConfig):
+        value, default = getattr(config.noise, field_.name), field_.default
+        if isinstance(default, tuple) and len(value) != len(default):
+            raise InputError(f"noise.{field_.name}: found {len(value)} numbers; accepted: {len(default)}")
+    ppo = config.ppo
+    if ppo.num_envs * ppo.num_steps < ppo.minibatches:
+        raise InputError(
+            f"ppo.minibatches: found {ppo.minibatches}; accepted: 1 to num_envs × num_steps = "
+            f"{ppo.num_envs * ppo.num_steps}"
+        )
+
+
+def _numbers(content: Any, name: str = "") -> Iterator[tuple[str, int | float]]:
+    """Every number of a nested dict with its dotted name; those of a list have the list's."""
+    if isinstance(content, dict):
+        for key, value in content.items():
+            yield from _numbers(value, f"{name}.{key}" if name else key)
+    elif isinstance(content, list):
+        for value in content:
+            yield from _numbers(value, name)
+    elif isinstance(content, int | float) and not isinstance(content, bool):
+        yield name, content
+
+
 T = TypeVar("T")
 
 
@@ -216,7 +277,7 @@ def to_dict(config: Any) -> dict[str, Any]:
 def config_hash(config: Config) -> str:
     """Content hash (16 hex digits) of every setting that changes a result."""
     content = to_dict(config)
-    for neutral in ("checkpoint_every", "evaluate_every", "iterations"):
+    for neutral in ("base", "checkpoint_every", "evaluate_every", "iterations"):
         content.pop(neutral)
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 

@@ -11,6 +11,10 @@ class InputError(Exception):
     """Bad input: the message names the file, the field, what was found and what is accepted."""
 
 
+class Interrupted(KeyboardInterrupt):
+    """A run that was stopped: the message says what was saved and how to go on."""
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
     """`; did you mean 'x'?` for the closest known name, or the list of known names."""
     known = list(known)
@@ -32,6 +36,6 @@ def run_command(command: Callable[[], None]) -> None:
         where = f"{error.filename}: " if error.filename else ""
         print(f"error: {where}{error.strerror or error}", file=sys.stderr)
         sys.exit(2)
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
+    except KeyboardInterrupt as stop:
+        print(str(stop) or "interrupted", file=sys.stderr)
         sys.exit(130)

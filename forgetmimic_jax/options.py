@@ -3,12 +3,30 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from collections.abc import Iterable
+from typing import Annotated, Any, TypeVar
 
+import tyro
 import yaml
 
 from forgetmimic_jax.config import Config, from_dict, to_dict
-from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.errors import InputError, nearest
+
+T = TypeVar("T")
+
+# One list for each time that --set is given: what a later one names does not replace an earlier one.
+Settings = Annotated[list[list[str]], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="SECTION.NAME=VALUE")]
+
+
+def parse(options: type[T], command: str) -> T:
+    """The command line as `options`; flags that are none end `python -m forgetmimic_jax.COMMAND` with exit code 2."""
+    return tyro.cli(options, prog=f"python -m forgetmimic_jax.{command}", config=(tyro.conf.FlagCreatePairsOff,))
+
+
+def at_least(minimum: int, flag: str, value: int) -> None:
+    """InputError unless the value given for `flag` is `minimum` or more."""
+    if value < minimum:
+        raise InputError(f"{flag}: found {value}; accepted: {minimum} or more")
 
 
 def comma_separated(text: str) -> tuple[str, ...]:
@@ -16,7 +34,7 @@ def comma_separated(text: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
 
 
-def override(config: Config, settings: list[str]) -> Config:
+def override(config: Config, settings: Iterable[str]) -> Config:
     """The config with settings of the form 'ppo.learning_rate=1e-4' replaced.
 
     Raises:
@@ -31,14 +49,18 @@ def override(config: Config, settings: list[str]) -> Config:
         table: Any = content
         for section in sections:
             if not isinstance(table.get(section), dict):
-                raise InputError(f"--set {setting}: no section '{section}'; known: {', '.join(content)}")
+                sections_here = [key for key, value in table.items() if isinstance(value, dict)]
+                raise InputError(f"--set {setting}: no section '{section}'; {nearest(section, sections_here)}")
             table = table[section]
-        table[name] = _value(text)
+        table[name] = _value(text, setting)
     return from_dict(Config, content, "--set")
 
 
-def _value(text: str) -> Any:
-    value = yaml.safe_load(text)
+def _value(text: str, setting: str) -> Any:
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError:
+        raise InputError(f"--set {setting}: '{text}' is no value; expected a number, a word or [a, list]") from None
     if isinstance(value, str):
         try:
             return float(value)  # YAML 1.1 reads 1e-4 as a string

@@ -71,6 +71,18 @@ def robot_names(robots_dir: Path = ROBOTS_DIR) -> list[str]:
     return sorted(path.parent.name for path in robots_dir.glob("*/*.yaml") if path.stem == path.parent.name)
 
 
+def roles_file(name: str, robots_dir: Path = ROBOTS_DIR) -> Path:
+    """The YAML of a robot's roles.
+
+    Raises:
+        InputError: unknown robot.
+    """
+    known = robot_names(robots_dir)
+    if name not in known:
+        raise InputError(f"robot '{name}': no robots/{name}/{name}.yaml; {nearest(name, known)}")
+    return robots_dir / name / f"{name}.yaml"
+
+
 def load_robot(
     name: str,
     *,
@@ -92,10 +104,7 @@ def load_robot(
     Raises:
         InputError: unknown robot, or a role that names a joint or body the model lacks.
     """
-    known = robot_names(robots_dir)
-    if name not in known:
-        raise InputError(f"robot '{name}': no robots/{name}/{name}.yaml; {nearest(name, known)}")
-    path = robots_dir / name / f"{name}.yaml"
+    path = roles_file(name, robots_dir)
     roles = _read_roles(path)
     if not (path.parent / roles["model"]).is_file():
         raise InputError(f"{path}: model: no file '{roles['model']}'")

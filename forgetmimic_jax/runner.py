@@ -24,6 +24,7 @@ from forgetmimic_jax.robot import Robot, load_robot
 from forgetmimic_jax.state import TrainState, init_state
 from forgetmimic_jax.tracking.env import Assets, Environment, make_assets, make_environment
 
+COMPILATION_CACHE = DATA_DIR.parent / ".cache" / "jax"  # what XLA compiled is not compiled again at the next start
 KEEP = 2  # newest checkpoints kept beside the named ones
 LOG_EVERY = 10  # iterations averaged into one row of metrics.jsonl
 
@@ -42,6 +43,8 @@ class Setup:
 
 def make_setup(config: Config) -> Setup:
     """Load what a config names; bad names are told before anything is written."""
+    if not jax.config.jax_compilation_cache_dir:
+        jax.config.update("jax_compilation_cache_dir", str(COMPILATION_CACHE))
     robot = load_robot(
         config.robot,
         timestep=config.physics.timestep,

@@ -1,5 +1,7 @@
 import dataclasses
+from functools import partial
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -34,12 +36,17 @@ QUARTER = np.exp(-0.25)  # a kernel with κ = 1/4 whose error is exactly σ
 WITH_JOINT_VELOCITY = RewardConfig(joint_velocity=1.0)
 
 
-def terms_of(robot, reference, bodies, joint_pos=None, joint_vel=None, config=WITH_JOINT_VELOCITY) -> dict:
+@partial(jax.jit, static_argnums=(0, 1))
+def compiled_reward(config, anchor, reference, bodies, joint_pos, joint_vel):
+    aligned = align_to_anchor(reference, anchor, bodies.pos[:, anchor], bodies.quat[:, anchor])
+    return tracking_reward(tracking_errors(reference, aligned, bodies, anchor, joint_pos, joint_vel), config)
+
+
+def terms_of(robot, reference, bodies, joint_pos=None, joint_vel=None) -> dict[str, np.ndarray]:
     joint_pos = reference.joint_pos if joint_pos is None else joint_pos
     joint_vel = reference.joint_vel if joint_vel is None else joint_vel
-    aligned = align_to_anchor(reference, robot.anchor, bodies.pos[:, robot.anchor], bodies.quat[:, robot.anchor])
-    errors = tracking_errors(reference, aligned, bodies, robot.anchor, joint_pos, joint_vel)
-    return {name: np.asarray(value) for name, value in tracking_reward(errors, config)[2].items()}
+    terms = compiled_reward(WITH_JOINT_VELOCITY, robot.anchor, reference, bodies, joint_pos, joint_vel)[2]
+    return {name: np.asarray(value) for name, value in terms.items()}
 
 
 def test_weights_are_the_papers_and_sum_to_eight():
@@ -55,10 +62,8 @@ def test_a_weight_of_zero_leaves_both_sum_and_mean():
 def test_reward_is_full_when_the_robot_is_the_reference(robot, library):
     clip, frame = jnp.array([0, 1, 0]), jnp.array([0, 20, 79])
     reference = lookup(library, clip, frame)
-    bodies = on_reference(reference)
-    aligned = align_to_anchor(reference, robot.anchor, bodies.pos[:, robot.anchor], bodies.quat[:, robot.anchor])
-    errors = tracking_errors(reference, aligned, bodies, robot.anchor, reference.joint_pos, reference.joint_vel)
-    total, normalized, _ = tracking_reward(errors, RewardConfig())
+    bodies, joints = on_reference(reference), (reference.joint_pos, reference.joint_vel)
+    total, normalized, _ = compiled_reward(RewardConfig(), robot.anchor, reference, bodies, *joints)
     np.testing.assert_allclose(total, 8.0, atol=1e-5)
     np.testing.assert_allclose(normalized, 1.0, atol=1e-6)
 
