@@ -1,0 +1,322 @@
+import dataclasses
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from forgetmimic_jax.config import Config
+from forgetmimic_jax.physics import BodyState, PhysicsParameters, PhysicsState
+from forgetmimic_jax.tracking import env as tracking
+from forgetmimic_jax.tracking.env import Environment, EnvState, make_assets, make_environment
+from forgetmimic_jax.tracking.reference import lookup
+
+ENVS = 4
+KEY = jax.random.PRNGKey(0)
+
+
+@dataclass
+class Puppet:
+    """An engine whose robot goes where the test says, and that keeps what it was told to do."""
+
+    next_physics: PhysicsState | None = None
+    next_bodies: BodyState | None = None
+    target: jax.Array | None = None
+    wrench: jax.Array | None = None
+    physics: PhysicsState | None = None
+
+    def step(self, state: PhysicsState, parameters: PhysicsParameters, target, wrench):
+        self.physics, self.target, self.wrench = state, target, wrench
+        return self.next_physics or state, self.next_bodies
+
+    def forward(self, state: PhysicsState, parameters: PhysicsParameters, mask, bodies: BodyState) -> BodyState:
+        return bodies
+
+
+@pytest.fixture(scope="module")
+def assets(robot, library, tiny_config):
+    return make_assets(tiny_config, robot, library)
+
+
+@pytest.fixture
+def puppet_env(robot, tiny_config):
+    """An environment without noise whose engine is a puppet."""
+    return Environment(tiny_config, robot, Puppet(), ENVS, noisy=False)
+
+
+def with_config(env: Environment, **sections) -> Environment:
+    return replace(env, config=dataclasses.replace(env.config, **sections))
+
+
+def start(env: Environment, assets, clip: list[int], frame: list[int], gain: float = 0.0) -> EnvState:
+    """Episodes at the frames given, exactly on the reference."""
+    clip_, frame_ = jnp.asarray(clip, jnp.int32), jnp.asarray(frame, jnp.int32)
+    gains = jnp.full(ENVS, gain, jnp.float32)
+    state = tracking.start_episodes(env, assets, KEY, clip_, jnp.zeros_like(clip_), frame_, gains)
+    physics, bodies = on_frame(env, assets, clip_, frame_)
+    return dataclasses.replace(state, physics=physics, bodies=bodies)
+
+
+def on_frame(env: Environment, assets, clip, frame) -> tuple[PhysicsState, BodyState]:
+    reference = lookup(assets.library, clip, frame)
+    root = env.robot.root
+    qpos = jnp.concatenate([reference.body_pos[:, root], reference.body_quat[:, root], reference.joint_pos], axis=-1)
+    qvel = jnp.concatenate([reference.body_lin_vel[:, root], jnp.zeros((ENVS, 3)), reference.joint_vel], axis=-1)
+    bodies = BodyState(
+        reference.body_pos, reference.body_quat, reference.body_lin_vel, reference.body_ang_vel,
+        jnp.zeros_like(reference.body_pos),
+    )  # fmt: skip
+    return PhysicsState(qpos, qvel, jnp.zeros_like(qvel)), bodies
+
+
+def follow(env: Environment, assets, state: EnvState, action=None):
+    """A step in which the robot arrives exactly at the next frame."""
+    env.engine.next_physics, env.engine.next_bodies = on_frame(env, assets, state.clip, state.frame + 1)
+    action = jnp.zeros((ENVS, 29)) if action is None else action
+    return tracking.step(env, assets, state, action, KEY)
+
+
+def rows(library, clip: list[int], frame: list[int], field: str) -> np.ndarray:
+    return np.asarray(getattr(library, field))[clip, frame]
+
+
+def test_a_step_moves_to_the_next_frame_and_remembers_the_action(puppet_env, assets):
+    state = start(puppet_env, assets, [0, 0, 1, 1], [0, 5, 9, 39])
+    action = jnp.full((ENVS, 29), 0.25)
+    after, _ = follow(puppet_env, assets, state, action)
+    np.testing.assert_array_equal(after.frame, [1, 6, 10, 40])
+    np.testing.assert_array_equal(after.step, [1, 1, 1, 1])
+    np.testing.assert_array_equal(after.last_action, action)
+    np.testing.assert_array_equal(after.clip, state.clip)
+
+
+def test_the_zero_action_asks_for_the_next_frames_joints(puppet_env, assets, library):
+    follow(puppet_env, assets, start(puppet_env, assets, [0, 0, 1, 1], [0, 5, 9, 39]))
+    expected = rows(library, [0, 0, 1, 1], [1, 6, 10, 40], "joint_pos")
+    np.testing.assert_allclose(puppet_env.engine.target, expected, atol=1e-6)
+
+
+def test_an_action_moves_the_target_by_a_quarter_of_effort_over_stiffness(robot, puppet_env, assets, library):
+    action = jnp.zeros((ENVS, 29)).at[:, robot.joint_names.index("left_knee_joint")].set(2.0)
+    follow(puppet_env, assets, start(puppet_env, assets, [0, 0, 1, 1], [0, 5, 9, 39]), action)
+    moved = np.asarray(puppet_env.engine.target) - rows(library, [0, 0, 1, 1], [1, 6, 10, 40], "joint_pos")
+    np.testing.assert_allclose(moved[:, robot.joint_names.index("left_knee_joint")], 2 * 0.3507, atol=1e-3)
+    assert np.count_nonzero(np.abs(moved[0]) > 1e-6) == 1
+
+
+def test_encoder_bias_moves_the_reading_one_way_and_the_robot_the_other(puppet_env, assets):
+    state = start(puppet_env, assets, [0] * ENVS, [3] * ENVS)
+    biased = dataclasses.replace(state, encoder_bias=jnp.full((ENVS, 29), 0.01))
+    follow(puppet_env, assets, state)
+    plain = np.asarray(puppet_env.engine.target)
+    follow(puppet_env, assets, biased)
+    np.testing.assert_allclose(np.asarray(puppet_env.engine.target) - plain, -0.01, atol=1e-6)
+    noiseless = dataclasses.replace(puppet_env.config.noise, **{
+        name: (0.0, 0.0, 0.0) if isinstance(value, tuple) else 0.0
+        for name, value in vars(puppet_env.config.noise).items() if name.startswith("observation")
+    })  # fmt: skip
+    env = with_config(puppet_env, noise=noiseless)
+    difference = tracking.observe(env, assets, biased, KEY)[0] - tracking.observe(env, assets, state, KEY)[0]
+    np.testing.assert_allclose(difference[:, 45:74], 0.01, atol=1e-6)
+    assert not np.delete(np.asarray(difference), np.s_[45:74], axis=1).any()
+
+
+def test_a_robot_that_follows_exactly_gets_the_whole_reward(puppet_env, assets):
+    state = start(puppet_env, assets, [0, 0, 1, 1], [0, 5, 9, 39])
+    after, result = follow(puppet_env, assets, state)
+    np.testing.assert_allclose(result.reward.tracking, 8.0, atol=1e-4)
+    np.testing.assert_allclose(result.reward.normalized_tracking, 1.0, atol=1e-5)
+    np.testing.assert_allclose(after.tracking_sum, 1.0, atol=1e-5)
+    np.testing.assert_allclose(after.terms, 1.0, atol=1e-5)
+    assert not np.asarray(result.terminated).any()
+
+
+def test_reward_compares_with_the_frame_that_the_step_reaches(puppet_env, assets):
+    state = start(puppet_env, assets, [0] * ENVS, [10] * ENVS)
+    puppet_env.engine.next_physics, puppet_env.engine.next_bodies = state.physics, state.bodies  # it does not move
+    _, result = tracking.step(puppet_env, assets, state, jnp.zeros((ENVS, 29)), KEY)
+    assert (np.asarray(result.reward.normalized_tracking) < 0.9999).all()
+    np.testing.assert_array_equal(result.reference.body_pos, rows(assets.library, [0] * ENVS, [11] * ENVS, "body_pos"))
+
+
+def test_a_clips_end_is_a_truncation_at_its_last_frame(puppet_env, assets):
+    state = start(puppet_env, assets, [0, 0, 1, 1], [76, 77, 37, 38])  # 80 and 41 frames: 3, 2, 3, 2 steps left
+    np.testing.assert_array_equal(state.horizon, [3, 2, 3, 2])
+    ends = []
+    for _ in range(3):
+        state, result = follow(puppet_env, assets, state)
+        assert not np.asarray(result.terminated).any()
+        ends.append(np.asarray(result.truncated))
+    np.testing.assert_array_equal(ends, [[False] * 4, [False, True, False, True], [True] * 4])
+    np.testing.assert_array_equal(state.frame, [79, 80, 40, 41])
+
+
+def test_the_time_limit_is_a_truncation_too(puppet_env, assets):
+    env = with_config(puppet_env, max_episode_steps=2)
+    state = start(env, assets, [0] * ENVS, [0] * ENVS)
+    np.testing.assert_array_equal(state.horizon, 2)
+    state, first = follow(env, assets, state)
+    state, second = follow(env, assets, state)
+    assert not np.asarray(first.truncated).any()
+    assert np.asarray(second.truncated).all()
+
+
+def test_a_fall_is_a_termination_even_in_the_last_step(puppet_env, assets):
+    state = start(puppet_env, assets, [1] * ENVS, [39] * ENVS)
+    _, bodies = on_frame(puppet_env, assets, state.clip, state.frame + 1)
+    fallen = bodies.pos.at[1, :, 2].add(-0.5)
+    puppet_env.engine.next_bodies = dataclasses.replace(bodies, pos=fallen)
+    _, result = tracking.step(puppet_env, assets, state, jnp.zeros((ENVS, 29)), KEY)
+    np.testing.assert_array_equal(result.terminated, [False, True, False, False])
+    np.testing.assert_array_equal(result.truncated, [True, False, True, True])
+    np.testing.assert_array_equal(result.causes["anchor_height"], [False, True, False, False])
+
+
+def test_after_a_clips_end_the_last_frame_is_shown(puppet_env, assets):
+    state = start(puppet_env, assets, [1] * ENVS, [39] * ENVS)
+    state, _ = follow(puppet_env, assets, state)
+    shown = tracking.observe(puppet_env, assets, state, None)[0][:, 10:39]
+    np.testing.assert_allclose(shown, rows(assets.library, [1] * ENVS, [40] * ENVS, "joint_pos"), atol=1e-6)
+
+
+def test_no_wrench_where_its_gain_is_off(puppet_env, assets):
+    follow(puppet_env, assets, start(puppet_env, assets, [0] * ENVS, [3] * ENVS, gain=0.5))
+    assert not np.asarray(puppet_env.engine.wrench).any()
+
+
+def test_the_wrench_is_the_episodes_gain_times_the_reference_wrench(robot, puppet_env, assets):
+    env = with_config(puppet_env, wrench=dataclasses.replace(puppet_env.config.wrench, max_gain=0.6))
+    gain = jnp.array([0.0, 0.2, 0.4, 0.6])
+    state = dataclasses.replace(start(env, assets, [0] * ENVS, [3] * ENVS), wrench_gain=gain)
+    follow(env, assets, state)
+    # On the reference the errors are zero: the force is M (a_ref − g) of the frame where the robot is.
+    acceleration = rows(assets.library, [0] * ENVS, [3] * ENVS, "anchor_lin_acc")
+    expected = np.asarray(gain)[:, None] * robot.model.body_mass.sum() * (acceleration - [0.0, 0.0, -9.81])
+    np.testing.assert_allclose(env.engine.wrench[:, :3], expected, rtol=1e-4, atol=1e-2)
+
+
+def test_pushes_come_when_the_countdown_is_over_and_then_after_the_drawn_interval(robot, tiny_config, assets):
+    noise = dataclasses.replace(tiny_config.noise, push_interval=(0.06, 0.06))  # every third step
+    env = Environment(dataclasses.replace(tiny_config, noise=noise), robot, Puppet(), ENVS, noisy=True)
+    state = dataclasses.replace(start(env, assets, [0] * ENVS, [0] * ENVS), push_countdown=jnp.full(ENVS, 2, jnp.int32))
+    pushed = []
+    for _ in range(9):
+        before = np.asarray(state.physics.qvel)
+        state, _ = follow(env, assets, state)
+        pushed.append(bool(np.any(np.asarray(env.engine.physics.qvel) != before)))
+    assert pushed == [False, False, True, False, False, True, False, False, True]
+
+
+def test_without_noise_nothing_is_pushed_or_randomised(puppet_env, assets):
+    state = dataclasses.replace(start(puppet_env, assets, [0] * ENVS, [0] * ENVS), push_countdown=jnp.zeros(ENVS, int))
+    follow(puppet_env, assets, state)
+    np.testing.assert_array_equal(puppet_env.engine.physics.qvel, state.physics.qvel)
+    np.testing.assert_allclose(state.parameters.foot_friction, puppet_env.nominal_friction)
+    assert not np.asarray(state.encoder_bias).any()
+    assert not np.asarray(state.parameters.torso_com).any()
+
+
+def test_noise_is_on_the_actors_observation_alone(puppet_env, assets):
+    state = start(puppet_env, assets, [0] * ENVS, [0] * ENVS)
+    clean_actor, clean_critic = tracking.observe(puppet_env, assets, state, None)
+    noisy_actor, noisy_critic = tracking.observe(puppet_env, assets, state, KEY)
+    assert np.asarray(noisy_actor[:, :103] != clean_actor[:, :103]).mean() > 0.99
+    np.testing.assert_array_equal(noisy_actor[:, 103:], clean_actor[:, 103:])
+    np.testing.assert_array_equal(noisy_critic, clean_critic)
+
+
+def test_resets_start_new_episodes_where_asked_and_only_there(puppet_env, assets):
+    state = start(puppet_env, assets, [0, 0, 1, 1], [10, 20, 5, 6])
+    state, _ = follow(puppet_env, assets, state, jnp.ones((ENVS, 29)))
+    mask = jnp.array([True, False, True, False])
+    one_bin = jnp.zeros(assets.bins.valid.shape).at[1, 1].set(1.0)
+    gains = jnp.zeros(assets.bins.valid.shape).at[1, 1].set(0.4)
+    after = tracking.reset_where(puppet_env, assets, state, mask, KEY, one_bin, gains)
+    for old, new in zip(jax.tree.leaves(state), jax.tree.leaves(after), strict=True):
+        np.testing.assert_array_equal(np.asarray(old)[1::2], np.asarray(new)[1::2])
+    np.testing.assert_array_equal(after.clip[::2], 1)
+    np.testing.assert_array_equal(after.start_bin[::2], 1)
+    assert ((after.frame[::2] >= assets.bins.start[1, 1]) & (after.frame[::2] < assets.bins.end[1, 1])).all()
+    np.testing.assert_allclose(after.wrench_gain[::2], 0.4)
+    for field in ("step", "tracking_sum", "last_action"):
+        assert not np.asarray(getattr(after, field))[::2].any()
+    np.testing.assert_array_equal(after.horizon[::2], 40 - after.frame[::2])
+
+
+def poisoned(state: EnvState, kind: str) -> EnvState:
+    """The state of a robot whose simulation is about to blow up: environment 1."""
+    qpos, qvel = state.physics.qpos, state.physics.qvel
+    if kind == "nan":
+        qpos = qpos.at[1, 9].set(jnp.nan)
+    elif kind == "inf":
+        qvel = qvel.at[1, 9].set(jnp.inf)
+    else:
+        qvel = qvel.at[1, 9].set(1e20)
+    return dataclasses.replace(state, physics=dataclasses.replace(state.physics, qpos=qpos, qvel=qvel))
+
+
+@pytest.fixture(scope="module")
+def native(robot, tiny_config, assets):
+    """A real environment on the C engine, with its step and reset compiled."""
+    env = make_environment(tiny_config, robot, ENVS)
+    return env, jax.jit(lambda state, action: tracking.step(env, assets, state, action, KEY))
+
+
+@pytest.mark.parametrize("kind", ["nan", "inf", "huge"])
+def test_a_diverged_robot_is_seen_and_its_reward_is_zero(native, assets, kind):
+    env, step = native
+    state = poisoned(start(env, assets, [0] * ENVS, [0] * ENVS), kind)
+    after, result = step(state, jnp.zeros((ENVS, 29)))
+    np.testing.assert_array_equal(result.diverged, [False, True, False, False])
+    np.testing.assert_array_equal(result.terminated, [False, True, False, False])
+    assert not np.asarray(result.truncated).any()
+    for leaf in jax.tree.leaves(result.reward):
+        assert np.isfinite(leaf).all()
+        assert leaf[1] == 0.0
+        assert (np.asarray(leaf)[[0, 2, 3]] != 0.0).all()
+    assert np.isfinite(after.tracking_sum).all()
+    assert np.isfinite(after.terms).all()
+
+
+def test_a_diverged_robot_is_whole_again_after_its_reset(native, assets):
+    env, step = native
+    state = poisoned(start(env, assets, [0] * ENVS, [0] * ENVS), "nan")
+    after, result = step(state, jnp.zeros((ENVS, 29)))
+    shape = assets.bins.valid.shape
+    uniform = assets.bins.valid / assets.bins.valid.sum()
+    fresh = tracking.reset_where(env, assets, after, result.terminated, KEY, uniform, jnp.zeros(shape))
+    for leaf in jax.tree.leaves((fresh, tracking.observe(env, assets, fresh, KEY))):
+        assert np.isfinite(leaf).all()
+
+
+def test_one_diverged_robot_changes_nothing_for_the_others(native, assets):
+    env, step = native
+    state = start(env, assets, [0, 1, 0, 1], [0, 4, 8, 9])
+    healthy, _ = step(state, jnp.zeros((ENVS, 29)))
+    sick, _ = step(poisoned(state, "nan"), jnp.zeros((ENVS, 29)))
+    for ours, theirs in zip(jax.tree.leaves(healthy), jax.tree.leaves(sick), strict=True):
+        np.testing.assert_array_equal(np.asarray(ours)[[0, 2, 3]], np.asarray(theirs)[[0, 2, 3]])
+
+
+def test_the_same_step_twice_is_the_same(native, assets):
+    env, step = native
+    state = start(env, assets, [0, 1, 0, 1], [0, 4, 8, 9])
+    first, second = (step(state, 0.1 * jnp.ones((ENVS, 29))) for _ in range(2))
+    for one, two in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True):
+        np.testing.assert_array_equal(one, two)
+
+
+def test_in_physics_the_zero_action_tracks_for_a_few_steps(native, assets):
+    env, step = native
+    state = start(env, assets, [0] * ENVS, [0, 10, 20, 30])
+    for _ in range(3):
+        state, result = step(state, jnp.zeros((ENVS, 29)))
+    assert (np.asarray(result.reward.normalized_tracking) > 0.9).all()
+    assert not np.asarray(result.terminated).any()
+
+
+def test_targets_are_marked_by_name(robot, library, tiny_config: Config):
+    unlearn = dataclasses.replace(tiny_config.unlearn, targets=("turn",))
+    marked = make_assets(dataclasses.replace(tiny_config, unlearn=unlearn), robot, library).is_target
+    np.testing.assert_array_equal(marked, [False, True])
