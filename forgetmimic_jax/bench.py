@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 import resource
@@ -14,9 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import tyro
-
 from forgetmimic_jax.errors import run_command
+from forgetmimic_jax.options import at_least, on_engine, parse, replace_given
 
 
 @dataclass
@@ -47,18 +45,19 @@ def main(options: Options) -> None:
 
     from forgetmimic_jax import runner
     from forgetmimic_jax.config import preset
-    from forgetmimic_jax.options import replace_given
     from forgetmimic_jax.physics.engine import resolve_engine
     from forgetmimic_jax.ppo.update import collect, make_iteration
     from forgetmimic_jax.tracking import env as tracking
     from forgetmimic_jax.tracking.rsi import bin_probabilities
 
-    config = replace_given(preset(options.preset), robot=options.robot, library=options.library and str(options.library))
-    if options.physics:
-        config = dataclasses.replace(config, physics=dataclasses.replace(config.physics, engine=options.physics))
+    at_least(1, "--repeats", options.repeats)
+    if options.output:
+        runner.check_writable(options.output.parent)
+    config = replace_given(preset(options.preset), robot=options.robot, library=options.library)
+    config = on_engine(config, options.physics)
     setup = runner.make_setup(config)
     env, assets, steps = setup.env, setup.assets, config.ppo.num_steps
-    state = runner.start_state(setup, None)
+    state = runner.start_state(setup)
     first_iteration = make_iteration(env)
     state, _ = jax.block_until_ready(first_iteration(assets, state))
     to_first_step = time.perf_counter() - started
@@ -88,13 +87,14 @@ def main(options: Options) -> None:
     measured: dict[str, list[float]] = {"raw": [], "environment": [], "collect": [], "iteration": []}
     for repeat in range(options.repeats):
         measured["raw"].append(raw())
-        measured["environment"].append(_timed(lambda r=repeat: environment(assets, state.env, jax.random.PRNGKey(r))))
-        measured["collect"].append(_timed(lambda: collect_only(assets, state)))
+        measured["environment"].append(_timed(environment, assets, state.env, jax.random.PRNGKey(repeat)))
+        measured["collect"].append(_timed(collect_only, assets, state))
         begin = time.perf_counter()
         state, _ = jax.block_until_ready(first_iteration(assets, state))
         measured["iteration"].append(time.perf_counter() - begin)
     median = {name: statistics.median(values) for name, values in measured.items()}
     env_steps = env.num_envs * steps
+    memory_unit = 2**30 if sys.platform == "darwin" else 2**20  # the system counts in bytes there, in KiB elsewhere
     figures = {
         "engine": resolve_engine(config.physics.engine),
         "cores": os.cpu_count(),
@@ -109,8 +109,8 @@ def main(options: Options) -> None:
         "share_policy_in_rollout": (median["collect"] - median["environment"]) / median["iteration"],
         "share_update": (median["iteration"] - median["collect"]) / median["iteration"],
         "seconds_to_first_iteration": to_first_step,
-        "peak_memory_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**30 if sys.platform == "darwin" else 2**20),
-    }  # fmt: skip
+        "peak_memory_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / memory_unit,
+    }
     table = Table(title=f"{config.robot}, preset {config.preset}, {figures['engine']} engine", title_justify="left")
     table.add_column("figure")
     table.add_column("value", justify="right")
@@ -144,13 +144,13 @@ def _raw_stepping(model, num_envs: int, substeps: int, physics, targets) -> Call
     return run
 
 
-def _timed(function: Callable[[], object]) -> float:
+def _timed(function: Callable[..., object], *arguments: object) -> float:
     import jax
 
     begin = time.perf_counter()
-    jax.block_until_ready(function())
+    jax.block_until_ready(function(*arguments))
     return time.perf_counter() - begin
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(tyro.cli(Options)))
+    run_command(lambda: main(parse(Options, "bench")))

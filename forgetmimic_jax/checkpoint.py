@@ -21,7 +21,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 from jax import Array
 
-from forgetmimic_jax.config import Config, load_config, save_config
+from forgetmimic_jax.config import Config, load_config, save_config, to_dict
 from forgetmimic_jax.errors import InputError
 from forgetmimic_jax.motion.library import MotionLibrary
 from forgetmimic_jax.robot import Robot
@@ -119,6 +119,8 @@ def read_info(path: Path) -> CheckpointInfo:
         raise InputError(f"{path}: no such checkpoint folder")
     try:
         meta = json.loads((path / META).read_text())
+        if meta["schema"] != SCHEMA:
+            raise InputError(f"{path / META}: schema: found {meta['schema']!r}; this version reads {SCHEMA}")
         known = dict(
             robot=meta["robot"],
             joints=tuple(meta["joints"]),
@@ -128,8 +130,12 @@ def read_info(path: Path) -> CheckpointInfo:
             environment_steps=int(meta["environment_steps"]),
         )
     except FileNotFoundError:
-        raise InputError(f"{path}: not a checkpoint: no {META}") from None
-    except (ValueError, KeyError, TypeError) as error:
+        newest = newest_checkpoint(path)
+        hint = f"; it is a run, whose newest checkpoint is {newest}" if newest else ""
+        raise InputError(f"{path}: not a checkpoint: no {META}{hint}") from None
+    except KeyError as error:
+        raise InputError(f"{path / META}: damaged: no {error.args[0]}") from None
+    except (ValueError, TypeError) as error:
         raise InputError(f"{path / META}: damaged: {error}") from None
     return CheckpointInfo(path=path, config=load_config(path / CONFIG), **known)
 
@@ -142,10 +148,12 @@ def check_matches(
     config: Config,
     *,
     other_library: bool = False,
+    resume: bool = False,
 ) -> None:
     """Say which of robot, joints, library or network differs between a checkpoint and what is asked.
 
-    `other_library` accepts other clips: a policy may be trained on with them.
+    `other_library` accepts other clips: a policy may be trained on with them. `resume` needs the same environments and
+    bins too.
 
     Raises:
         InputError: something differs.
@@ -167,10 +175,16 @@ def check_matches(
             f"{info.path}: library: the checkpoint's hash is {info.library_hash}, this library's {library_hash} "
             f"({difference or 'same clip names, other content'})"
         )
-    for field in ("actor_layers", "critic_layers"):
-        theirs, ours = getattr(info.config.ppo, field), getattr(config.ppo, field)
-        if theirs != ours:
-            raise InputError(f"{info.path}: ppo.{field}: the checkpoint's is {list(theirs)}, asked for {list(ours)}")
+    shaping = [("ppo", "actor_layers"), ("ppo", "critic_layers")]
+    if resume:
+        shaping += [("ppo", "num_envs"), ("sampling", "bin_seconds")]
+    theirs, ours = to_dict(info.config), to_dict(config)
+    for section, name in shaping:
+        if theirs[section][name] != ours[section][name]:
+            raise InputError(
+                f"{info.path}: {section}.{name}: the checkpoint's is {theirs[section][name]}, "
+                f"asked for {ours[section][name]}"
+            )
 
 
 def load_policy(path: Path, template: TrainState) -> Policy:
@@ -194,10 +208,15 @@ def load_state(path: Path, template: TrainState) -> TrainState:
         return TrainState(policy=policy, failure_level=failure_level, **_restore(path / RUN, _run_part(template)))
 
 
+def checkpoints(directory: Path) -> list[Path]:
+    """The checkpoints of a run by iteration; a folder whose name is no number was named by hand and is not one."""
+    found = [path for path in (directory / "checkpoints").glob("*") if path.name.isdigit() and (path / META).is_file()]
+    return sorted(found, key=lambda path: int(path.name))
+
+
 def newest_checkpoint(directory: Path) -> Path | None:
     """The checkpoint of the highest iteration under `directory`/checkpoints, if any."""
-    found = [path for path in (directory / "checkpoints").glob("[0-9]*") if (path / META).is_file()]
-    return max(found, key=lambda path: int(path.name), default=None)
+    return next(reversed(checkpoints(directory)), None)
 
 
 def _run_part(state: TrainState) -> dict[str, Any]:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import tyro
-
 from forgetmimic_jax.errors import run_command
+from forgetmimic_jax.options import at_least, comma_separated, on_engine, parse, replace_given
 
 
 @dataclass
@@ -40,19 +38,20 @@ def main(options: Options) -> None:
     """Evaluate, write the files and print the table."""
     from forgetmimic_jax import checkpoint, runner
     from forgetmimic_jax.console import closing
-    from forgetmimic_jax.errors import InputError
     from forgetmimic_jax.evaluation.evaluate import cost, evaluate, show_and_write
-    from forgetmimic_jax.options import comma_separated
 
-    if options.episodes < 1:
-        raise InputError(f"--episodes: found {options.episodes}; at least 1 is needed")
+    at_least(1, "--episodes", options.episodes)
+    at_least(0, "--seed", options.seed)
     path = options.checkpoint or runner.base_folder(options.robot)
+    if options.output:
+        output = options.output
+    elif path.parent.name == "checkpoints":
+        output = path.parent.parent
+    else:
+        output = Path("runs") / f"evaluate-{options.robot}"
+    runner.check_writable(output)
     info = checkpoint.read_info(path)
-    config = dataclasses.replace(info.config, robot=options.robot)
-    if options.library:
-        config = dataclasses.replace(config, library=str(options.library))
-    if options.physics:
-        config = dataclasses.replace(config, physics=dataclasses.replace(config.physics, engine=options.physics))
+    config = on_engine(replace_given(info.config, robot=options.robot, library=options.library), options.physics)
     setup = runner.make_setup(config)
     checkpoint.check_matches(info, setup.robot, setup.library, setup.library_hash, config)
     targets = info.config.unlearn.targets if options.targets is None else comma_separated(options.targets)
@@ -62,7 +61,7 @@ def main(options: Options) -> None:
     policies = {name: checkpoint.load_policy(path, shapes)}
     budget = {name: cost(info)}
     if name == "unlearned":
-        base = options.base or runner.base_folder(options.robot)
+        base = options.base or runner.base_checkpoint(info.config)
         base_info = checkpoint.read_info(base)
         checkpoint.check_matches(base_info, setup.robot, setup.library, setup.library_hash, config)
         policies = {"base": checkpoint.load_policy(base, shapes), **policies}
@@ -73,20 +72,14 @@ def main(options: Options) -> None:
         setup.library,
         setup.library_hash,
         policies,
-        checkpoint=str(path),
+        checkpoint=str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path),
         targets=targets,
         episodes=options.episodes,
         seed=options.seed,
         budget=budget,
     )
-    if options.output:
-        output = options.output
-    elif path.parent.name == "checkpoints":
-        output = path.parent.parent
-    else:
-        output = Path("runs") / f"evaluate-{options.robot}"
     closing(show_and_write(output, document), f"make unlearn ROBOT={options.robot}")
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(tyro.cli(Options)))
+    run_command(lambda: main(parse(Options, "evaluate")))

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable
-from typing import Annotated, Any, TypeVar
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
 
 import tyro
 import yaml
 
-from forgetmimic_jax.config import Config, from_dict, to_dict
+from forgetmimic_jax.config import Config, PhysicsConfig, from_dict, to_dict
 from forgetmimic_jax.errors import InputError, nearest
 
 T = TypeVar("T")
+C = TypeVar("C", Config, PhysicsConfig)
 
 # One list for each time that --set is given: what a later one names does not replace an earlier one.
 Settings = Annotated[list[list[str]], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="SECTION.NAME=VALUE")]
@@ -21,6 +23,14 @@ Settings = Annotated[list[list[str]], tyro.conf.UseAppendAction, tyro.conf.arg(m
 def parse(options: type[T], command: str) -> T:
     """The command line as `options`; flags that are none end `python -m forgetmimic_jax.COMMAND` with exit code 2."""
     return tyro.cli(options, prog=f"python -m forgetmimic_jax.{command}", config=(tyro.conf.FlagCreatePairsOff,))
+
+
+def check_same(options: Any, saved: dict[str, Any]) -> None:
+    """With --resume the run's own settings hold: InputError for a flag that was given with another value."""
+    for name, value in saved.items():
+        given = getattr(options, name)
+        if given != getattr(type(options), name) and str(given) != str(value):
+            raise InputError(f"--{name}: found {given}, but the run to resume has {value}; leave the flag out")
 
 
 def at_least(minimum: int, flag: str, value: int) -> None:
@@ -69,6 +79,14 @@ def _value(text: str, setting: str) -> Any:
     return value
 
 
-def replace_given(config: Config, **values: Any) -> Config:
-    """The config with every value that is not None replaced."""
-    return dataclasses.replace(config, **{name: value for name, value in values.items() if value is not None})
+def replace_given(config: C, **values: Any) -> C:
+    """The config with every value that is not None replaced; a path becomes text, as the config holds it."""
+    given: dict[str, Any] = {
+        name: str(value) if isinstance(value, Path) else value for name, value in values.items() if value is not None
+    }
+    return dataclasses.replace(config, **given)
+
+
+def on_engine(config: Config, engine: Literal["auto", "native", "mjx", "mjx-warp"] | None) -> Config:
+    """The config on another physics engine, if one is named."""
+    return dataclasses.replace(config, physics=replace_given(config.physics, engine=engine))

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
+import os
 import shutil
 import signal
 from collections.abc import Iterator, Mapping
@@ -12,15 +14,17 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from forgetmimic_jax import checkpoint
-from forgetmimic_jax.config import Config, save_config
+from forgetmimic_jax.config import Config, save_config, validate
 from forgetmimic_jax.console import progress
-from forgetmimic_jax.errors import InputError, nearest
+from forgetmimic_jax.errors import InputError, Interrupted, nearest
+from forgetmimic_jax.motion.clip import write_atomically
 from forgetmimic_jax.motion.library import DATA_DIR, MotionLibrary, library_hash, load_library, read_manifest
 from forgetmimic_jax.ppo.update import make_iteration
-from forgetmimic_jax.robot import Robot, load_robot
+from forgetmimic_jax.robot import Robot, load_robot, roles_file
 from forgetmimic_jax.state import TrainState, init_state
 from forgetmimic_jax.tracking.env import Assets, Environment, make_assets, make_environment
 
@@ -42,7 +46,8 @@ class Setup:
 
 
 def make_setup(config: Config) -> Setup:
-    """Load what a config names; bad names are told before anything is written."""
+    """Load what a config names; bad names and numbers are told before anything is written."""
+    validate(config)
     if not jax.config.jax_compilation_cache_dir:
         jax.config.update("jax_compilation_cache_dir", str(COMPILATION_CACHE))
     robot = load_robot(
@@ -53,7 +58,7 @@ def make_setup(config: Config) -> Setup:
         self_collision=config.physics.self_collision,
     )
     folder = library_folder(config)
-    library = load_library(robot, folder)
+    library = load_library(robot, folder, fps=1.0 / (config.physics.timestep * config.physics.substeps))
     check_targets(config.unlearn.targets, library.names)
     env = make_environment(config, robot, config.ppo.num_envs)
     return Setup(config, robot, library, library_hash(folder), env, make_assets(config, robot, library))
@@ -64,16 +69,17 @@ def template(setup: Setup) -> TrainState:
     return jax.eval_shape(lambda key: init_state(setup.env, setup.assets, key), jax.random.PRNGKey(0))
 
 
-def start_state(setup: Setup, base: Path | None) -> TrainState:
-    """A fresh run's state; with `base` a warm start from that checkpoint's policy.
+def start_state(setup: Setup) -> TrainState:
+    """A fresh run's state; with a base, a warm start from its policy.
 
     Training may go on with other clips than the base's; unlearning needs the base's own.
     """
     key = jax.random.PRNGKey(setup.config.seed)
-    if base is None:
-        return jax.jit(lambda assets, key: init_state(setup.env, assets, key))(setup.assets, key)
-    info = checkpoint.read_info(base)
     unlearning = bool(setup.config.unlearn.targets)
+    if setup.config.base is None and not unlearning:
+        return jax.jit(lambda assets, key: init_state(setup.env, assets, key))(setup.assets, key)
+    base = base_checkpoint(setup.config)
+    info = checkpoint.read_info(base)
     checkpoint.check_matches(
         info, setup.robot, setup.library, setup.library_hash, setup.config, other_library=not unlearning
     )
@@ -107,9 +113,22 @@ def default_targets(config: Config) -> tuple[str, ...]:
     return tuple(read_manifest(library_folder(config)).get("default_targets", ()))
 
 
+def base_checkpoint(config: Config) -> Path:
+    """The checkpoint that an unlearning run starts from: the one it names, or the shipped one."""
+    return base_folder(config.robot) if config.base is None else Path(config.base)
+
+
 def base_folder(robot: str) -> Path:
-    """Where a robot's shipped base policy lies."""
-    return DATA_DIR / robot / "base"
+    """Where a robot's shipped base policy lies.
+
+    Raises:
+        InputError: unknown robot, or none is shipped for it.
+    """
+    roles_file(robot)
+    folder = DATA_DIR / robot / "base"
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no policy is shipped for '{robot}'; train one and name its checkpoint")
+    return folder
 
 
 def default_folder(kind: str, *, resume: bool) -> Path:
@@ -124,16 +143,36 @@ def prepare_folder(directory: Path, *, resume: bool) -> Path | None:
     """The newest checkpoint to resume from; without `resume` the folder must be new or empty.
 
     Raises:
-        InputError: the folder exists, or there is nothing to resume.
+        InputError: the folder exists or cannot be written, or there is nothing to resume.
     """
+    check_writable(directory)
     if resume:
         newest = checkpoint.newest_checkpoint(directory)
         if newest is None:
             raise InputError(f"{directory}: --resume finds no checkpoint there; leave it out to start")
         return newest
-    if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
-        raise InputError(f"{directory}: exists already; choose another --output, or go on with --resume")
+    if directory.exists() and any(directory.iterdir()):
+        other = "go on with --resume" if checkpoint.newest_checkpoint(directory) else "remove it"
+        raise InputError(f"{directory}: exists already; choose another --output, or {other}")
     return None
+
+
+def check_writable(directory: Path) -> None:
+    """InputError unless `directory` can be written to or made."""
+    existing = next(path for path in (directory, *directory.parents) if path.exists())
+    if not existing.is_dir():
+        raise InputError(f"{directory}: {existing} is a file; choose another --output")
+    if not os.access(existing, os.W_OK):
+        raise InputError(f"{directory}: no permission to write in {existing}; choose another --output")
+
+
+def interrupted(config: Config, directory: Path) -> Interrupted:
+    """What a stopped run says at its end: what it saved, and the command that goes on."""
+    command = "unlearn" if config.unlearn.targets else "pretrain"
+    return Interrupted(
+        f"stopped; saved {checkpoint.newest_checkpoint(directory)}; "
+        f"go on with: make {command} ROBOT={config.robot} RESUME=1 OUTPUT={directory}"
+    )
 
 
 def run(
@@ -141,60 +180,78 @@ def run(
     directory: Path,
     *,
     description: str,
-    base: Path | None = None,
     resume: bool = False,
 ) -> tuple[Path, TrainState]:
     """Train until `config.iterations`; returns the last checkpoint's folder and the state.
 
-    The folder gets config.yaml, metrics.jsonl (means over LOG_EVERY iterations), TensorBoard events and checkpoints/.
-    Ctrl-C and SIGTERM end the current iteration, save, and raise KeyboardInterrupt.
+    The folder gets config.yaml, metrics.jsonl (means over LOG_EVERY iterations), TensorBoard events and checkpoints/,
+    the first of them before the first iteration, so that a run that is killed can always go on.
+    Ctrl-C and SIGTERM end the current iteration, save, and raise Interrupted.
     """
     config = setup.config
     newest = prepare_folder(directory, resume=resume)
     if newest is None:
-        state = start_state(setup, base)
-        directory.mkdir(parents=True, exist_ok=True)
-        save_config(config, directory / "config.yaml")
-        environment_steps = 0
+        state, environment_steps = start_state(setup), 0
     else:
-        info = checkpoint.read_info(newest)
-        checkpoint.check_matches(info, setup.robot, setup.library, setup.library_hash, config)
-        state = checkpoint.load_state(newest, template(setup))
-        environment_steps = info.environment_steps
-        _drop_rows_after(directory / "metrics.jsonl", info.iteration)
+        state, environment_steps = _saved_state(setup, newest)
     iteration = int(state.iteration)
     steps_per_iteration = config.ppo.num_envs * config.ppo.num_steps
     iterate = make_iteration(setup.env)
-    saved: Path | None = newest
+    directory.mkdir(parents=True, exist_ok=True)
+    saved = newest
 
     def save() -> Path:
+        # A row never spans a checkpoint: what is resumed has all of its rows in the file.
+        log.write(iteration, environment_steps, setup.library.names)
         path = directory / "checkpoints" / f"{iteration:08d}"
         checkpoint.save_checkpoint(
             path, state, config, setup.robot, setup.library, setup.library_hash, environment_steps=environment_steps
         )
-        for old in sorted((directory / "checkpoints").glob("[0-9]*"))[:-KEEP]:
+        for old in checkpoint.checkpoints(directory)[:-KEEP]:
             shutil.rmtree(old)
         return path
 
-    with _Log(directory) as log, _stop_requests() as stop, progress(
-        description, config.iterations, start=iteration
-    ) as report:
-        while iteration < config.iterations and not stop:
-            state, metrics = iterate(setup.assets, state)
-            metrics = jax.device_get(metrics)
-            iteration += 1
-            environment_steps += steps_per_iteration
-            log.add(metrics)
-            if iteration % LOG_EVERY == 0 or iteration == config.iterations:
-                log.write(iteration, environment_steps, setup.library.names)
-            report(iteration, environment_steps, _live(metrics))
-            if iteration % config.checkpoint_every == 0:
+    try:
+        save_config(config, directory / "config.yaml")
+        with (
+            _Log(directory, iteration, environment_steps) as log,
+            _stop_requests() as stop,
+            progress(description, config.iterations, start=iteration) as report,
+        ):
+            saved = saved or save()
+            while iteration < config.iterations and not stop:
+                state, metrics = iterate(setup.assets, state)
+                metrics = jax.device_get(metrics)
+                iteration += 1
+                environment_steps += steps_per_iteration
+                log.add(metrics)
+                if iteration % LOG_EVERY == 0:
+                    log.write(iteration, environment_steps, setup.library.names)
+                report(iteration, environment_steps, _live(metrics))
+                if iteration % config.checkpoint_every == 0:
+                    saved = save()
+            if int(saved.name) != iteration:
                 saved = save()
-        if saved is None or int(saved.name) != iteration:
-            saved = save()
-    if stop and iteration < config.iterations:
-        raise KeyboardInterrupt
+    except BaseException as error:
+        if saved is None:
+            shutil.rmtree(directory, ignore_errors=True)  # nothing in it to go on with
+        elif isinstance(error, KeyboardInterrupt):
+            raise interrupted(config, directory) from None
+        raise
+    if stop:
+        raise interrupted(config, directory)
     return saved, state
+
+
+def _saved_state(setup: Setup, path: Path) -> tuple[TrainState, int]:
+    """The state of a checkpoint of this run, and the environment steps behind it."""
+    info = checkpoint.read_info(path)
+    checkpoint.check_matches(info, setup.robot, setup.library, setup.library_hash, setup.config, resume=True)
+    state = checkpoint.load_state(path, template(setup))
+    step_size = setup.config.ppo.learning_rate
+    if step_size != info.config.ppo.learning_rate:  # changed with --set; else the state's own holds
+        state = dataclasses.replace(state, learning_rate=jnp.asarray(step_size, jnp.float32))
+    return state, info.environment_steps
 
 
 def _live(metrics: Mapping[str, np.ndarray]) -> dict[str, float]:
@@ -207,11 +264,13 @@ def _live(metrics: Mapping[str, np.ndarray]) -> dict[str, float]:
 class _Log:
     """metrics.jsonl and TensorBoard events: means over the iterations since the last row."""
 
-    def __init__(self, directory: Path):
+    def __init__(self, directory: Path, iteration: int, environment_steps: int):
         from tensorboardX import SummaryWriter
 
-        self._file = (directory / "metrics.jsonl").open("a")
-        self._events = SummaryWriter(str(directory / "events"))
+        path = directory / "metrics.jsonl"
+        _drop_rows_after(path, iteration)
+        self._file = path.open("a")
+        self._events = SummaryWriter(str(directory / "events"), purge_step=environment_steps + 1)
         self._rows: list[Mapping[str, np.ndarray]] = []
 
     def __enter__(self) -> _Log:
@@ -226,6 +285,8 @@ class _Log:
 
     def write(self, iteration: int, environment_steps: int, clips: tuple[str, ...]) -> None:
         rows, self._rows = self._rows, []
+        if not rows:
+            return
         mean = {name: np.mean([row[name] for row in rows], axis=0) for name in rows[0]}
         out: dict[str, Any] = {"iteration": iteration, "environment_steps": environment_steps}
         out |= {name: float(value) for name, value in mean.items() if np.ndim(value) == 0}
@@ -240,7 +301,8 @@ class _Log:
             "step_share": steps / steps.sum(),
         }
         out["clips"] = {
-            clip: {name: round(float(values[i]), 5) for name, values in per_clip.items()} for i, clip in enumerate(clips)
+            clip: {name: round(float(values[i]), 5) for name, values in per_clip.items()}
+            for i, clip in enumerate(clips)
         }
         self._file.write(json.dumps(out) + "\n")
         self._file.flush()
@@ -254,10 +316,15 @@ class _Log:
 
 
 def _drop_rows_after(path: Path, iteration: int) -> None:
-    """Rows logged after the checkpoint that is resumed from would be logged twice."""
-    if path.exists():
-        rows = [line for line in path.read_text().splitlines() if json.loads(line)["iteration"] <= iteration]
-        path.write_text("".join(f"{row}\n" for row in rows))
+    """Rows after the checkpoint that is resumed from would be logged twice; a killed run may end in half a row."""
+    if not path.exists():
+        return
+    kept = []
+    for line in path.read_text().splitlines():
+        with contextlib.suppress(ValueError):
+            if json.loads(line)["iteration"] <= iteration:
+                kept.append(line)
+    write_atomically(path, "".join(f"{line}\n" for line in kept).encode())
 
 
 @contextlib.contextmanager

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
+import itertools
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
-
-import tyro
+from typing import Literal
 
 from forgetmimic_jax.errors import run_command
+from forgetmimic_jax.options import Settings, check_same, on_engine, override, parse, replace_given
 
 
 @dataclass
@@ -34,7 +33,7 @@ class Options:
     """Folder of the run; runs/train-ROBOT by default."""
     resume: bool = False
     """Go on from the newest checkpoint in the output folder, with the settings saved there."""
-    set: Annotated[list[str], tyro.conf.arg(metavar="SECTION.NAME=VALUE")] = field(default_factory=list)
+    set: Settings = field(default_factory=list)
     """Any other settings, such as ppo.learning_rate=1e-4."""
 
 
@@ -43,25 +42,28 @@ def main(options: Options) -> None:
     from forgetmimic_jax import runner
     from forgetmimic_jax.config import load_config, preset
     from forgetmimic_jax.console import closing
-    from forgetmimic_jax.options import override, replace_given
 
     output = options.output or Path("runs") / f"train-{options.robot}"
+    runner.prepare_folder(output, resume=options.resume)
     if options.resume:
         config = load_config(output / "config.yaml")
+        check_same(options, {name: getattr(config, name) for name in ("robot", "preset", "seed", "library", "base")})
     else:
-        library = str(options.library) if options.library else None
-        config = replace_given(preset(options.preset), robot=options.robot, seed=options.seed, library=library)
-    config = override(replace_given(config, iterations=options.iterations), options.set)
-    if options.physics:
-        config = dataclasses.replace(config, physics=dataclasses.replace(config.physics, engine=options.physics))
-    runner.prepare_folder(output, resume=options.resume)
-    setup = runner.make_setup(config)
-    path, _ = runner.run(setup, output, description=f"train {config.robot}", base=options.base, resume=options.resume)
+        config = replace_given(
+            preset(options.preset),
+            robot=options.robot,
+            seed=options.seed,
+            library=options.library,
+            base=options.base,
+        )
+    config = override(replace_given(config, iterations=options.iterations), itertools.chain(*options.set))
+    setup = runner.make_setup(on_engine(config, options.physics))
+    path, _ = runner.run(setup, output, description=f"train {config.robot}", resume=options.resume)
     closing(
         {"checkpoint": path, "curves": output / "metrics.jsonl", "TensorBoard": output / "events"},
-        f"python -m forgetmimic_jax.evaluate --robot {config.robot} --checkpoint {path}",
+        f"make evaluate ROBOT={config.robot} CHECKPOINT={path}",
     )
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(tyro.cli(Options)))
+    run_command(lambda: main(parse(Options, "train")))

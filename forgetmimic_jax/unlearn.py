@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Any, Literal
 
-import tyro
-
-from forgetmimic_jax.errors import run_command
+from forgetmimic_jax.config import Config, UnlearnConfig, load_config, preset
+from forgetmimic_jax.errors import InputError, run_command
+from forgetmimic_jax.options import (
+    Settings,
+    at_least,
+    check_same,
+    comma_separated,
+    on_engine,
+    override,
+    parse,
+    replace_given,
+)
 
 
 @dataclass
@@ -43,7 +53,7 @@ class Options:
     """Folder of the run; the next free runs/unlearn-ROBOT-NUMBER by default."""
     resume: bool = False
     """Go on from the newest checkpoint in the output folder (by default the newest run), with its settings."""
-    set: Annotated[list[str], tyro.conf.arg(metavar="SECTION.NAME=VALUE")] = field(default_factory=list)
+    set: Settings = field(default_factory=list)
     """Any other settings, such as sampling.rule=adaptive."""
 
 
@@ -53,64 +63,69 @@ ITERATIONS = {"cpu": 400, "paper": 1000}
 def main(options: Options) -> None:
     """Unlearn, evaluate base, unlearned and zero action, and print what was forgotten and what was kept."""
     from forgetmimic_jax import checkpoint, runner
-    from forgetmimic_jax.config import UnlearnConfig, load_config, preset
     from forgetmimic_jax.console import closing
-    from forgetmimic_jax.errors import InputError
     from forgetmimic_jax.evaluation.evaluate import cost, evaluate, show_and_write
-    from forgetmimic_jax.options import comma_separated, override
-    from forgetmimic_jax.unlearning.antireward import unlearning_config
 
-    if not options.penalty > 0:
-        raise InputError(f"--penalty: found {options.penalty:g}; a number above 0 is needed (the paper's is 16)")
-    if options.episodes < 1:
-        raise InputError(f"--episodes: found {options.episodes}; at least 1 is needed")
+    at_least(1, "--episodes", options.episodes)
     output = options.output or runner.default_folder(f"unlearn-{options.robot}", resume=options.resume)
     runner.prepare_folder(output, resume=options.resume)
-    base = options.base or runner.base_folder(options.robot)
+    config = _config_of_run(options, output) if options.resume else _config_of_new_run(options)
+    config = override(replace_given(config, iterations=options.iterations), itertools.chain(*options.set))
+    if not config.unlearn.targets:
+        raise InputError("--targets: no clip named; name at least one to forget, such as --targets punch,kick")
+    setup = runner.make_setup(on_engine(config, options.physics))
+    base = runner.base_checkpoint(config)
     info = checkpoint.read_info(base)
-    if options.resume:
-        config = load_config(output / "config.yaml")
-        if options.iterations is not None:
-            config = dataclasses.replace(config, iterations=options.iterations)
-    else:
-        config = dataclasses.replace(info.config, robot=options.robot, seed=options.seed)
-        if options.library:
-            config = dataclasses.replace(config, library=str(options.library))
-        if options.preset:
-            # The network is the base's: it is what unlearning starts from.
-            network = {"actor_layers": config.ppo.actor_layers, "critic_layers": config.ppo.critic_layers}
-            asked = preset(options.preset)
-            config = dataclasses.replace(
-                asked, robot=config.robot, seed=config.seed, library=config.library,
-                ppo=dataclasses.replace(asked.ppo, **network),
-            )  # fmt: skip
-        targets = runner.default_targets(config) if options.targets is None else comma_separated(options.targets)
-        if not targets:
-            raise InputError("--targets: no clip named; name at least one to forget, such as --targets punch,kick")
-        config = unlearning_config(config, UnlearnConfig(targets=targets, penalty=options.penalty))
-        config = dataclasses.replace(config, iterations=options.iterations or ITERATIONS[options.preset or "cpu"])
-        config = override(config, options.set)
-    if options.physics:
-        config = dataclasses.replace(config, physics=dataclasses.replace(config.physics, engine=options.physics))
-    setup = runner.make_setup(config)
+    checkpoint.check_matches(info, setup.robot, setup.library, setup.library_hash, config)
     description = f"forget {', '.join(config.unlearn.targets)}"
-    path, state = runner.run(setup, output, description=description, base=base, resume=options.resume)
+    path, state = runner.run(setup, output, description=description, resume=options.resume)
     base_policy = checkpoint.load_policy(base, runner.template(setup))
-    document = evaluate(
-        config,
-        setup.robot,
-        setup.library,
-        setup.library_hash,
-        {"base": base_policy, "unlearned": state.policy},
-        checkpoint=str(path),
-        targets=config.unlearn.targets,
-        episodes=options.episodes,
-        seed=config.seed,
-        budget={"base": cost(info), "unlearned": cost(checkpoint.read_info(path))},
-    )
+    try:
+        document = evaluate(
+            setup.config,
+            setup.robot,
+            setup.library,
+            setup.library_hash,
+            {"base": base_policy, "unlearned": state.policy},
+            checkpoint=str(path),
+            targets=config.unlearn.targets,
+            episodes=options.episodes,
+            seed=config.seed,
+            budget={"base": cost(info), "unlearned": cost(checkpoint.read_info(path))},
+        )
+    except KeyboardInterrupt:
+        raise runner.interrupted(config, output) from None
     files = {"unlearned policy": path, **show_and_write(output, document), "curves": output / "metrics.jsonl"}
     closing(files, f"make evaluate ROBOT={config.robot} CHECKPOINT={path} EPISODES=100")
 
 
+def _config_of_new_run(options: Options) -> Config:
+    """The base's settings, or the preset's, with the anti-reward."""
+    from forgetmimic_jax import checkpoint, runner
+    from forgetmimic_jax.unlearning.antireward import unlearning_config
+
+    base = checkpoint.read_info(options.base or runner.base_folder(options.robot)).config
+    config = base
+    if options.preset:
+        config = preset(options.preset)
+        # The network is the base's: it is what unlearning starts from.
+        layers: dict[str, Any] = {name: getattr(base.ppo, name) for name in ("actor_layers", "critic_layers")}
+        config = dataclasses.replace(config, library=base.library, ppo=dataclasses.replace(config.ppo, **layers))
+    config = dataclasses.replace(config, base=None, iterations=ITERATIONS[options.preset or "cpu"])
+    config = replace_given(config, robot=options.robot, seed=options.seed, library=options.library, base=options.base)
+    targets = runner.default_targets(config) if options.targets is None else comma_separated(options.targets)
+    return unlearning_config(config, UnlearnConfig(targets=targets, penalty=options.penalty))
+
+
+def _config_of_run(options: Options, output: Path) -> Config:
+    """The settings of the run to resume, which no flag contradicts."""
+    config = load_config(output / "config.yaml")
+    if options.targets is not None:
+        options = dataclasses.replace(options, targets=",".join(comma_separated(options.targets)))
+    check_same(options, {name: getattr(config, name) for name in ("robot", "preset", "seed", "library", "base")})
+    check_same(options, {"targets": ",".join(config.unlearn.targets), "penalty": config.unlearn.penalty})
+    return config
+
+
 if __name__ == "__main__":
-    run_command(lambda: main(tyro.cli(Options)))
+    run_command(lambda: main(parse(Options, "unlearn")))
