@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from flax import struct
 from jax import Array
 
 from forgetmimic_jax.errors import InputError, nearest
-from forgetmimic_jax.motion.clip import Clip, read_clip, write_atomically
+from forgetmimic_jax.motion.clip import Clip, read_clip, write_atomically, write_clip
 from forgetmimic_jax.motion.kinematics import body_motion, configuration, rate, resample
 from forgetmimic_jax.robot import Robot
 
@@ -144,6 +145,43 @@ def read_manifest(path: Path) -> dict[str, Any]:
 def write_manifest(path: Path, manifest: dict[str, Any]) -> None:
     """Write the folder's manifest in one atomic step."""
     write_atomically(path / MANIFEST, (json.dumps(manifest, indent=2) + "\n").encode())
+
+
+def add_clip(path: Path, robot: Robot, clip: Clip, facts: Mapping[str, Any], *, overwrite: bool = False) -> Path:
+    """Write a clip and its manifest entry; a folder that is no library yet becomes one.
+
+    Args:
+        path: the library's folder.
+        robot: whose clip it is.
+        clip: at the library's rate.
+        facts: for the manifest, such as source and licence.
+        overwrite: replace a clip of that name.
+
+    Raises:
+        InputError: a name that cannot be a file's, another robot's library, another rate, or a name that is taken.
+    """
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", clip.name):
+        raise InputError(f"name: found '{clip.name}'; letters, digits, - and _ are accepted, a letter or digit first")
+    _check_joints(clip, robot)
+    if (path / MANIFEST).exists():
+        manifest = read_manifest(path)
+    else:
+        if path.is_dir() and any(path.iterdir()):
+            raise InputError(f"{path}: has files but no {MANIFEST}; give an empty or a new folder, or a library")
+        manifest = {"schema": SCHEMA, "robot": robot.name, "fps": clip.fps, "default_targets": [], "clips": {}}
+    if manifest["robot"] != robot.name:
+        raise InputError(f"{path / MANIFEST}: robot: found '{manifest['robot']}'; the clip is '{robot.name}'s")
+    if manifest["fps"] != clip.fps:
+        raise InputError(f"{path / MANIFEST}: fps: found {manifest['fps']}; the clip has {clip.fps}")
+    if clip.name in manifest["clips"] and not overwrite:
+        raise InputError(f"{path}: already has a clip '{clip.name}'; give another --name, or --force to replace it")
+    path.mkdir(parents=True, exist_ok=True)
+    file = path / f"{clip.name}.npz"
+    write_clip(clip, file)
+    measures = {"frames": clip.num_frames, "seconds": clip.seconds}
+    manifest["clips"][clip.name] = {"sha256": file_hash(file), **facts, **measures}
+    write_manifest(path, manifest)
+    return file
 
 
 def file_hash(path: Path) -> str:

@@ -1,0 +1,161 @@
+"""How well a clip suits the robot: floor contact, joint limits, smoothness, seams and free flight, against a bar."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from forgetmimic_jax.motion.clip import Clip
+from forgetmimic_jax.motion.contact import SIDES, FloorPoints, floor_points, floor_positions
+from forgetmimic_jax.motion.kinematics import configuration, rate
+from forgetmimic_jax.robot import Robot
+
+STANCE_HEIGHT = 0.05  # m: a foot this low …
+STANCE_SPEED = 0.3  # m/s: … and this slow stands
+TOUCHING = 0.01  # m: a sole point this low touches the floor
+FLIGHT_CLEARANCE = 0.02  # m: with every point above it the robot flies
+FLIGHT_FRAMES = 5  # shorter hops hold no acceleration worth reading
+JITTER_HZ = 12.0  # a body's own motion is slower
+
+# The bar a clip has to pass.
+MAX_DEPTH = 0.02  # m under the floor, of any shape
+MAX_STANCE_HEIGHT = 0.02  # m of a standing sole off the floor
+MAX_SKATE = 0.10  # m/s
+MAX_SEAM_RATIO = 1.5  # a jump stands out by far more; a step or a landing at the seam reaches 1.2
+MAX_JITTER = 0.02
+MAX_FLIGHT_ERROR = 5.0  # m/s^2 from gravity
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Measures of one clip; None where the clip has no such phase."""
+
+    name: str
+    seconds: float
+    sole_lowest: float  # m, lowest point of any sole
+    stance_height: float | None  # m, 95th percentile of a standing foot's distance from the floor
+    skate: float | None  # m/s, mean horizontal speed of the sole points that touch the floor
+    other_lowest: float  # m, lowest point of any other shape
+    joint_speed: float  # largest share of a motor's speed
+    limit_excess: float  # rad beyond a joint's limit, the largest
+    joint_acceleration: float  # rad/s^2, 99th percentile of each frame's fastest joint
+    jitter: float  # share of the joint velocity's power above JITTER_HZ
+    seam: float | None  # velocity jump where cycles meet, over the largest change elsewhere; cyclic clips
+    flight_acceleration: float | None  # m/s^2, vertical, of the centre of mass, median of flight
+
+    def failures(self) -> list[str]:
+        """What misses the bar, in words; empty where the clip passes."""
+        checks = [
+            (self.limit_excess > 1e-4, f"a joint {self.limit_excess:.3f} rad beyond its limit"),
+            (self.joint_speed > 1.0, f"a joint at {self.joint_speed:.2f} of its motor's speed"),
+            (self.sole_lowest < -MAX_DEPTH, f"a sole {-100 * self.sole_lowest:.1f} cm under the floor"),
+            (self.other_lowest < -MAX_DEPTH, f"a shape {-100 * self.other_lowest:.1f} cm under the floor"),
+            (self.jitter > MAX_JITTER, f"jitter: {100 * self.jitter:.1f} % of the joints' power above 12 Hz"),
+        ]
+        if self.stance_height is not None:
+            height = f"soles {100 * self.stance_height:.1f} cm from the floor in stance"
+            checks.append((self.stance_height > MAX_STANCE_HEIGHT, height))
+        if self.skate is not None:
+            checks.append((self.skate > MAX_SKATE, f"soles skate at {self.skate:.2f} m/s"))
+        if self.seam is not None:
+            checks.append((self.seam > MAX_SEAM_RATIO, f"velocity jumps at the seam ({self.seam:.2f} x elsewhere)"))
+        if self.flight_acceleration is not None:
+            error = abs(self.flight_acceleration + 9.81)
+            checks.append(
+                (
+                    error > MAX_FLIGHT_ERROR,
+                    f"off the floor it accelerates at {self.flight_acceleration:.1f} m/s^2 upwards, not -9.8",
+                )
+            )
+        return [words for failed, words in checks if failed]
+
+
+def measure(robot: Robot, clip: Clip, cycle_frames: int | None = None) -> Quality:
+    """Measure a clip.
+
+    Args:
+        robot: whose clip it is.
+        clip: the motion.
+        cycle_frames: frames of one cycle of a tiled clip; None for a motion that does not repeat.
+    """
+    qpos = configuration(clip, robot)
+    points = floor_points(robot)
+    positions = floor_positions(robot, points, qpos)
+    height = positions[..., 2]
+    joints = qpos[:, 7:]
+    joint_vel = np.diff(joints, axis=0) * clip.fps
+    acceleration = np.abs(np.diff(joint_vel, axis=0)) * clip.fps
+    beyond = np.maximum(joints - robot.joint_upper, robot.joint_lower - joints)
+    return Quality(
+        name=clip.name,
+        seconds=clip.seconds,
+        sole_lowest=float(height[:, points.is_sole].min()),
+        stance_height=_stance_height(points, positions, clip.fps),
+        skate=_skate(points, positions, clip.fps),
+        other_lowest=float(height[:, ~points.is_sole].min()),
+        joint_speed=float((np.abs(joint_vel) / robot.joint_velocity_limit).max()),
+        limit_excess=float(max(0.0, beyond.max())),
+        joint_acceleration=float(np.percentile(acceleration.max(axis=1), 99)) if len(acceleration) else 0.0,
+        jitter=_jitter(joint_vel, clip.fps),
+        seam=None if cycle_frames is None else seam_ratio(joint_vel, cycle_frames),
+        flight_acceleration=_flight_acceleration(robot, qpos, height.min(axis=1), clip.fps),
+    )
+
+
+def seam_ratio(joint_vel: np.ndarray, cycle_frames: int) -> float | None:
+    """Largest change of a joint's velocity where two cycles meet, over the largest anywhere else.
+
+    Args:
+        joint_vel: [frame - 1, joint] differences from frame to frame.
+        cycle_frames: frames in a cycle.
+    """
+    change = np.abs(np.diff(joint_vel, axis=0)).max(axis=1)  # row k: at frame k + 1
+    at_seam = np.isin((np.arange(len(change)) + 1) % cycle_frames, (0, cycle_frames - 1))
+    if not at_seam.any() or at_seam.all():
+        return None
+    return float(change[at_seam].max() / max(change[~at_seam].max(), 1e-9))
+
+
+def _stance_height(points: FloorPoints, positions: np.ndarray, fps: float) -> float | None:
+    heights = []
+    for side in SIDES:
+        foot = positions[:, points.foot(side)]
+        speed = np.linalg.norm(rate(foot.mean(axis=1), fps), axis=-1)
+        lowest = foot[..., 2].min(axis=1)
+        heights.append(lowest[(lowest < STANCE_HEIGHT) & (speed < STANCE_SPEED)])
+    every = np.abs(np.concatenate(heights))
+    return float(np.percentile(every, 95)) if len(every) else None
+
+
+def _skate(points: FloorPoints, positions: np.ndarray, fps: float) -> float | None:
+    soles = positions[:, points.is_sole]
+    speed = np.linalg.norm(np.diff(soles[..., :2], axis=0), axis=-1) * fps
+    touching = (soles[:-1, :, 2] < TOUCHING) & (soles[1:, :, 2] < TOUCHING)
+    return float(speed[touching].mean()) if touching.any() else None
+
+
+def _jitter(joint_vel: np.ndarray, fps: float) -> float:
+    power = np.abs(np.fft.rfft((joint_vel - joint_vel.mean(axis=0)) * np.hanning(len(joint_vel))[:, None], axis=0)) ** 2
+    fast = np.fft.rfftfreq(len(joint_vel), 1.0 / fps) > JITTER_HZ
+    return float(power[fast].sum() / max(power.sum(), 1e-12))
+
+
+def _flight_acceleration(robot: Robot, qpos: np.ndarray, lowest: np.ndarray, fps: float) -> float | None:
+    flying = lowest > FLIGHT_CLEARANCE
+    starts = np.flatnonzero(np.diff(np.concatenate([[False], flying]).astype(int)) == 1)
+    ends = np.flatnonzero(np.diff(np.concatenate([flying, [False]]).astype(int)) == -1) + 1
+    data = mujoco.MjData(robot.model)
+    found: list[np.ndarray] = []
+    for start, end in zip(starts, ends, strict=True):
+        if end - start < FLIGHT_FRAMES:
+            continue
+        com = []
+        for configuration_row in qpos[start:end]:
+            data.qpos[:] = configuration_row
+            mujoco.mj_kinematics(robot.model, data)
+            mujoco.mj_comPos(robot.model, data)
+            com.append(data.subtree_com[1][2])
+        found.append(np.diff(com, n=2) * fps**2)
+    return float(np.median(np.concatenate(found))) if found else None
