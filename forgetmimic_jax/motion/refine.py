@@ -13,8 +13,7 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from scipy.sparse import bsr_matrix
-from scipy.sparse.linalg import splu
+from scipy.linalg import solveh_banded
 from scipy.spatial.transform import Rotation
 
 from forgetmimic_jax.motion.contact import FloorPoints, HumanContact
@@ -31,13 +30,15 @@ class Weights:
 
     hip_centre: float = 2.0  # per m
     posture: float = 0.03  # per rad from the default pose
+    wrist_posture: float = 0.2  # the same for the wrists, which the human skeleton lacks
     stance_height: float = 40.0  # per m of a planted sole point off the floor
     stance_slip: float = 150.0  # per m a planted sole point moves in one frame
-    floor: float = 60.0  # per m below the floor
+    floor: float = 60.0  # per m below the floor, or below the clearance of a sole that swings
     flight: float = 0.04  # per m/s^2 of the centre of mass off free fall
     limit: float = 20.0  # per rad beyond the joint's limit less its margin
     speed: float = 0.3  # per rad/s beyond the share of the motor's speed
     smooth_hz: float = 6.0  # jerk is weighed so that motion faster than this is smoothed away
+    clearance: float = 0.02  # m that a swinging sole keeps above the floor
 
 
 class Pose(NamedTuple):
@@ -164,9 +165,7 @@ class _Problem:
             pose.points[frame, :bodies] = data.xpos
             pose.turns[frame] = data.xmat.reshape(-1, 3, 3)
             turns = pose.turns[frame, self.floor.body]
-            pose.points[frame, bodies:] = data.xpos[self.floor.body] + np.einsum(
-                "pij,pj->pi", turns, self.floor.local
-            )
+            pose.points[frame, bodies:] = data.xpos[self.floor.body] + np.einsum("pij,pj->pi", turns, self.floor.local)
             for body in range(bodies):
                 mujoco.mj_jacBody(model, data, pose.points_jac[frame, body], pose.turns_jac[frame, body], body)
             for row, body in enumerate(self.floor.body):
@@ -200,11 +199,10 @@ class _Problem:
         error = pose.points[:, hips].mean(axis=1) - self.targets.hip_centre
         yield Term(every, weight * error, {0: weight * pose.points_jac[:, hips].mean(axis=1)})
         default = np.asarray(self.robot.arrays.default_joint_pos, np.float64)
-        yield Term(
-            every,
-            self.weights.posture * (qpos[:, 7:] - default),
-            {0: np.broadcast_to(self.weights.posture * self._joint_rows(), (self.frames, *self._joint_rows().shape))},
-        )
+        wrist = np.array(["wrist" in joint for joint in self.robot.joint_names])
+        pull = np.where(wrist, self.weights.wrist_posture, self.weights.posture)
+        rows = np.broadcast_to(pull[:, None] * self._joint_rows(), (self.frames, len(pull), self.robot.model.nv))
+        yield Term(every, pull * (qpos[:, 7:] - default), {0: rows})
 
     def contacts(self, pose: Pose) -> Iterator[Term]:
         """Planted soles stay at the floor and do not slip, nothing goes under it, a body in flight falls freely."""
@@ -212,16 +210,19 @@ class _Problem:
         every = np.arange(self.frames)
         pos, jac = pose.points[:, bodies:], pose.points_jac[:, bodies:]
         height = pos[..., 2]
-        stance = np.stack([self.contact.stance.get(name, np.zeros(self.frames)) for name in self.floor.sole], axis=1)
+        planted, lifted = self._by_point(self.contact.planted), self._by_point(self.contact.lifted)
 
-        planted = self.weights.stance_height * stance
-        yield Term(every, planted * height, {0: planted[..., None] * jac[:, :, 2]})
-        under = self.weights.floor * (height < 0.0)
-        yield Term(every, under * height, {0: under[..., None] * jac[:, :, 2]})
+        touched = planted.any(axis=0)
+        hold = self.weights.stance_height * planted[:, touched]
+        yield Term(every, hold * height[:, touched], {0: hold[..., None] * jac[:, touched, 2]})
+        short = height - self.weights.clearance * lifted
+        under = self.weights.floor * (short < 0.0)
+        yield Term(every, under * short, {0: under[..., None] * jac[:, :, 2]})
 
         here, ahead = self._frames_with(1)
+        planted, pos, jac = planted[:, touched], pos[:, touched], jac[:, touched]
         pos_ahead, jac_ahead = self._ahead(pos, jac, here, 1)
-        hold = self.weights.stance_slip * np.minimum(stance[here], stance[ahead])[..., None]
+        hold = self.weights.stance_slip * np.minimum(planted[here], planted[ahead])[..., None]
         rows = (len(here), -1)
         yield Term(
             here,
@@ -298,6 +299,11 @@ class _Problem:
         }
         yield Term(first, weight * jerk, {offset: weight * jacobian for offset, jacobian in jacobians.items()})
 
+    def _by_point(self, parts: dict[str, np.ndarray]) -> np.ndarray:
+        """A weight by part [frame] laid out over the floor points [frame, point]."""
+        none = np.zeros(self.frames)
+        return np.stack([parts.get(part, none) for part in self.floor.part], axis=1)
+
     def _joint_rows(self) -> np.ndarray:
         """Jacobian [joint, nv] of the joint angles."""
         return np.eye(self.robot.model.nv)[6:]
@@ -335,28 +341,34 @@ def _solve(terms: list[Term], frames: int, nv: int, cyclic: bool, damping: float
     for term in terms:
         for offset, jacobian in term.jacobians.items():
             at = (term.frame + offset) % frames
-            np.add.at(gradient, at, np.einsum("tmi,tm->ti", jacobian, term.residual))
+            gradient[at] += np.einsum("tmi,tm->ti", jacobian, term.residual)
             for other, other_jacobian in term.jacobians.items():
                 if other >= offset:
                     product = np.swapaxes(jacobian, -1, -2) @ other_jacobian
-                    np.add.at(blocks[other - offset], at, product)
+                    blocks[other - offset, at] += product
     blocks[0] += damping * np.eye(nv)
-    rows, columns, values = [], [], []
+
+    # A cyclic clip is folded (0, n-1, 1, n-2, ...), which turns the circle into a band of twice the width.
+    every = np.arange(frames)
+    place = np.where(every < (frames + 1) // 2, 2 * every, 2 * (frames - 1 - every) + 1) if cyclic else every
+    width = (2 * reach + 1 if cyclic else reach + 1) * nv
+    band = np.zeros((width, frames * nv))
+    row, column = np.meshgrid(np.arange(nv), np.arange(nv), indexing="ij")
     for ahead in range(reach + 1):
-        here = np.arange(frames if cyclic else frames - ahead)
+        here = every if cyclic else every[: frames - ahead]
         there = (here + ahead) % frames
-        rows.append(here)
-        columns.append(there)
-        values.append(blocks[ahead, here])
-        if ahead:
-            rows.append(there)
-            columns.append(here)
-            values.append(np.swapaxes(blocks[ahead, here], -1, -2))
-    row, column, value = np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
-    order = np.lexsort((column, row))
-    pointers = np.searchsorted(row[order], np.arange(frames + 1))
-    matrix = bsr_matrix((value[order], column[order], pointers), shape=(frames * nv, frames * nv))
-    return -splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A").solve(gradient.reshape(-1)).reshape(frames, nv)
+        for block, down, right in (
+            (blocks[ahead, here], place[here], place[there]),
+            (np.swapaxes(blocks[ahead, here], -1, -2), place[there], place[here]),
+        )[: 2 if ahead else 1]:
+            down_entry = down[:, None, None] * nv + row
+            right_entry = right[:, None, None] * nv + column
+            lower = down_entry >= right_entry
+            band[(down_entry - right_entry)[lower], right_entry[lower]] += block[lower]
+    solution = np.empty((frames, nv))
+    order = np.argsort(place)
+    solution[order] = -solveh_banded(band, gradient[order].reshape(-1), lower=True).reshape(frames, nv)
+    return solution
 
 
 def rotation_of(matrices: np.ndarray) -> Rotation:
