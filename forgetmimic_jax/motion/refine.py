@@ -21,6 +21,7 @@ from forgetmimic_jax.motion.kinematics import PlanarTransform, rotation
 from forgetmimic_jax.motion.retarget import Targets
 from forgetmimic_jax.robot import Robot
 
+SEAM_SECONDS = 0.12  # half width of the more smoothed seam
 GRAVITY = np.array([0.0, 0.0, -9.81])
 
 
@@ -38,6 +39,7 @@ class Weights:
     limit: float = 20.0  # per rad beyond the joint's limit less its margin
     speed: float = 0.3  # per rad/s beyond the share of the motor's speed
     smooth_hz: float = 6.0  # jerk is weighed so that motion faster than this is smoothed away
+    seam: float = 5.0  # times more where cycles meet, since a recording may stop one motion there and start another
     clearance: float = 0.02  # m that a swinging sole keeps above the floor
 
 
@@ -266,7 +268,6 @@ class _Problem:
 
     def smoothness(self, qpos: np.ndarray) -> Iterator[Term]:
         """Third differences of the root's and the joints' motion."""
-        weight = 1.0 / (2.0 * np.pi * self.weights.smooth_hz / self.fps) ** 3
         nv = self.robot.model.nv
         here, ahead = self._frames_with(1)
         pos_ahead, _ = self._ahead(qpos[:, None, :3], None, here, 1)
@@ -297,7 +298,19 @@ class _Problem:
             2: -2.0 * after[rows[1]] + before[rows[2]],
             3: after[rows[2]],
         }
-        yield Term(first, weight * jerk, {offset: weight * jacobian for offset, jacobian in jacobians.items()})
+        weight = self._smoothing(first)
+        yield Term(
+            first, weight * jerk, {offset: weight[..., None] * jacobian for offset, jacobian in jacobians.items()}
+        )
+
+    def _smoothing(self, first: np.ndarray) -> np.ndarray:
+        """Weight [row, 1] of the third differences that start at frame `first`, larger about a seam."""
+        weight = np.full((len(first), 1), 1.0 / (2.0 * np.pi * self.weights.smooth_hz / self.fps) ** 3)
+        if self.step is not None:
+            middle = (first + 1.5) % self.frames
+            distance = np.minimum(middle, self.frames - middle)[:, None] / self.fps
+            weight *= 1.0 + (self.weights.seam - 1.0) * np.exp(-((distance / SEAM_SECONDS) ** 2))
+        return weight
 
     def _by_point(self, parts: dict[str, np.ndarray]) -> np.ndarray:
         """A weight by part [frame] laid out over the floor points [frame, point]."""
