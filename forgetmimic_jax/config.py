@@ -143,7 +143,6 @@ class PPOConfig:
     actor_layers: tuple[int, ...] = (1024, 512, 256, 128)
     critic_layers: tuple[int, ...] = (1024, 1024, 512, 256)
     initial_std: float = 1.0
-    noise_correlation: float = 0.0  # ρ of the exploration noise from step to step; 0: independent, as in the paper
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,6 @@ class TrainState:
     optimizer: optax.OptState
     learning_rate: Array  # []
     env: EnvState
-    exploration: Array  # [env, joint] the exploration noise in units of its standard deviation
     failure_level: Array  # [clip, bin] L
     key: Array
     iteration: Array  # i32[]
@@ -81,7 +80,7 @@ def init_state(
         failure_level: L [clip, bin] of an earlier run, for the `frozen` sampler.
     """
     config = env.config
-    state_key, policy_key, start_key, episode_key, noise_key = jax.random.split(key, 5)
+    state_key, policy_key, start_key, episode_key = jax.random.split(key, 4)
     if failure_level is None:
         failure_level = jnp.where(assets.bins.valid, jnp.float32(config.sampling.initial_failure), 0.0)
     zeros = jnp.zeros((env.num_envs,), jnp.int32)
@@ -97,7 +96,6 @@ def init_state(
         optimizer=make_optimizer(config).init((policy.actor, policy.critic)),
         learning_rate=jnp.asarray(config.ppo.learning_rate, jnp.float32),
         env=episodes,
-        exploration=jax.random.normal(noise_key, (env.num_envs, env.robot.num_joints)),
         failure_level=failure_level,
         key=state_key,
         iteration=jnp.zeros((), jnp.int32),

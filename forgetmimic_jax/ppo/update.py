@@ -84,11 +84,10 @@ def collect(env: Environment, assets: Assets, state: TrainState) -> tuple[TrainS
         return network.value(critic, policy.critic, normalize(policy.critic_normalizer, observation))
 
     def one_step(carry, key: Array):
-        before, actor_obs, critic_obs, exploration = carry
+        before, actor_obs, critic_obs = carry
         action_key, step_key, reset_key, observe_key = jax.random.split(key, 4)
         mean, log_std = network.distribution(actor, policy.actor, normalize(policy.actor_normalizer, actor_obs))
-        exploration = correlated_noise(exploration, action_key, config.ppo.noise_correlation)
-        action = mean + jnp.exp(log_std) * exploration
+        action = mean + jnp.exp(log_std) * jax.random.normal(action_key, mean.shape)
         after, result = tracking.step(env, assets, before, action, step_key)
         done = result.terminated | result.truncated
         fresh = tracking.reset_where(env, assets, after, done, reset_key, probabilities, gains)
@@ -116,24 +115,13 @@ def collect(env: Environment, assets: Assets, state: TrainState) -> tuple[TrainS
             wrench_gain=before.wrench_gain,
             causes=result.causes,
         )
-        return (fresh, next_actor_obs, next_critic_obs, exploration), trajectory
+        return (fresh, next_actor_obs, next_critic_obs), trajectory
 
     key, first_key, rollout_key = jax.random.split(state.key, 3)
     first = tracking.observe(env, assets, state.env, first_key if env.noisy else None)
     keys = jax.random.split(rollout_key, config.ppo.num_steps)
-    carry = (state.env, *first, state.exploration)
-    (episodes, _, _, exploration), trajectory = jax.lax.scan(one_step, carry, keys)
-    return dataclasses.replace(state, env=episodes, exploration=exploration, key=key), trajectory
-
-
-def correlated_noise(noise: Array, key: Array, correlation: float) -> Array:
-    """The next standard normal noise [env, joint], correlated with the last one.
-
-    A joint moves little under noise that changes its mind 50 times a second, so little is learned from it. The
-    likelihoods stay those of independent noise (Hollenstein et al. 2024, "Colored Noise in PPO").
-    """
-    fresh = jax.random.normal(key, noise.shape)
-    return correlation * noise + (1.0 - correlation**2) ** 0.5 * fresh
+    (episodes, _, _), trajectory = jax.lax.scan(one_step, (state.env, *first), keys)
+    return dataclasses.replace(state, env=episodes, key=key), trajectory
 
 
 def improve(
@@ -178,7 +166,7 @@ def improve(
             learning_rate = adapt_learning_rate(
                 learning_rate, metrics["kl"], config.target_kl, config.min_learning_rate, config.max_learning_rate
             )
-        metrics["gradient_norm"] = optax.global_norm(gradient)
+        metrics["gradient_norm"] = optax.tree.norm(gradient)
         updates, optimizer_state = optimizer.update(gradient, optimizer_state)
         params = jax.tree.map(lambda p, u: p - learning_rate * u, params, updates)
         return (params, optimizer_state, learning_rate), metrics
