@@ -6,12 +6,11 @@ run to another. `run/` holds all the rest of the TrainState, for resuming; a shi
 
 from __future__ import annotations
 
-import contextlib
+import hashlib
 import json
 import os
 import re
 import shutil
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -43,6 +42,7 @@ class CheckpointInfo:
     library_hash: str
     iteration: int
     environment_steps: int
+    files: dict[str, str]  # sha256 of each file of the trees
 
 
 def save_checkpoint(
@@ -77,7 +77,7 @@ def save_checkpoint(
     trees: dict[str, Any] = {POLICY: {"policy": state.policy}, SAMPLER: {"failure_level": state.failure_level}}
     if resumable:
         trees[RUN] = _run_part(state)
-    meta = {
+    meta: dict[str, Any] = {
         "schema": SCHEMA,
         "robot": robot.name,
         "joints": list(robot.joint_names),
@@ -95,6 +95,7 @@ def save_checkpoint(
             for name, tree in trees.items():
                 checkpointer.save((temporary / name).resolve(), tree)
                 checkpointer.wait_until_finished()
+        meta["files"] = _hashes(temporary)
         save_config(config, temporary / CONFIG)
         (temporary / META).write_text(json.dumps(meta, indent=2) + "\n")
         shutil.rmtree(path, ignore_errors=True)
@@ -128,6 +129,7 @@ def read_info(path: Path) -> CheckpointInfo:
             library_hash=meta["library_hash"],
             iteration=int(meta["iteration"]),
             environment_steps=int(meta["environment_steps"]),
+            files=dict(meta.get("files", {})),
         )
     except FileNotFoundError:
         newest = newest_checkpoint(path)
@@ -189,14 +191,12 @@ def check_matches(
 
 def load_policy(path: Path, template: TrainState) -> Policy:
     """A checkpoint's networks and normalisers; `template` gives the shapes (`jax.eval_shape` of `init_state`)."""
-    with _explained(path):
-        return _restore(path / POLICY, {"policy": template.policy})["policy"]
+    return _restore(path, POLICY, {"policy": template.policy})["policy"]
 
 
 def load_failure_level(path: Path, template: TrainState) -> Array:
     """A checkpoint's failure levels L [clip, bin]."""
-    with _explained(path):
-        return _restore(path / SAMPLER, {"failure_level": template.failure_level})["failure_level"]
+    return _restore(path, SAMPLER, {"failure_level": template.failure_level})["failure_level"]
 
 
 def load_state(path: Path, template: TrainState) -> TrainState:
@@ -204,8 +204,7 @@ def load_state(path: Path, template: TrainState) -> TrainState:
     if not (path / RUN).is_dir():
         raise InputError(f"{path}: holds a policy but no {RUN}/ to resume from; start a new run with --base {path}")
     policy, failure_level = load_policy(path, template), load_failure_level(path, template)
-    with _explained(path):
-        return TrainState(policy=policy, failure_level=failure_level, **_restore(path / RUN, _run_part(template)))
+    return TrainState(policy=policy, failure_level=failure_level, **_restore(path, RUN, _run_part(template)))
 
 
 def checkpoints(directory: Path) -> list[Path]:
@@ -223,19 +222,36 @@ def _run_part(state: TrainState) -> dict[str, Any]:
     return {name: getattr(state, name) for name in vars(state) if name not in ("policy", "failure_level")}
 
 
-def _restore(path: Path, template: Any) -> Any:
+def _restore(path: Path, part: str, template: Any) -> Any:
+    """One tree of a checkpoint, in the structure and of the shapes of `template`."""
+    _check_files(read_info(path), part)
     abstract = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), template)
-    with ocp.StandardCheckpointer() as checkpointer:
-        return checkpointer.restore(path.resolve(), abstract)
-
-
-@contextlib.contextmanager
-def _explained(path: Path) -> Iterator[None]:
-    # Orbax reports a damaged tree by many exception types; all of them mean the same to a user.
     try:
-        yield
-    except InputError:
-        raise
+        with ocp.StandardCheckpointer() as checkpointer:
+            restored = checkpointer.restore((path / part).resolve(), abstract)
     except Exception as error:
+        # Orbax reports another structure by many exception types; all of them mean the same to a user.
         first = str(error).strip().splitlines() or [type(error).__name__]
-        raise InputError(f"{path}: damaged, incomplete or of another shape: {first[0][:200]}") from error
+        raise InputError(f"{path / part}: damaged or of another structure: {first[0][:200]}") from error
+    # Orbax gives what is there, whatever shape was asked for.
+    for (where, found), asked in zip(
+        jax.tree_util.tree_leaves_with_path(restored), jax.tree.leaves(abstract), strict=True
+    ):
+        if found.shape != asked.shape:
+            name = jax.tree_util.keystr(where, simple=True, separator=".")
+            raise InputError(f"{path / part}: {name}: found shape {list(found.shape)}; {list(asked.shape)} is needed")
+    return restored
+
+
+def _hashes(folder: Path) -> dict[str, str]:
+    files = sorted(file for file in folder.rglob("*") if file.is_file())
+    return {file.relative_to(folder).as_posix(): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
+
+
+def _check_files(info: CheckpointInfo, part: str) -> None:
+    """InputError unless every file of a tree is there and as it was written."""
+    found = {f"{part}/{name}": sha256 for name, sha256 in _hashes(info.path / part).items()}
+    for name, sha256 in info.files.items():
+        if name.startswith(f"{part}/") and found.get(name) != sha256:
+            trouble = "damaged: not what was saved" if name in found else "missing"
+            raise InputError(f"{info.path / name}: {trouble}; the checkpoint cannot be used")
