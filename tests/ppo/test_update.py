@@ -1,0 +1,288 @@
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from forgetmimic_jax.physics import Engine
+from forgetmimic_jax.physics.native import NativeEngine
+from forgetmimic_jax.ppo.network import Normalizer
+from forgetmimic_jax.ppo.update import Trajectory, collect, correlated_noise, improve, learn_sampler, make_iteration
+from forgetmimic_jax.state import TrainState, init_policy, init_state, make_actor, make_critic, make_optimizer
+from forgetmimic_jax.tracking.env import Assets, Environment, make_assets
+from forgetmimic_jax.unlearning.antireward import unlearning_config
+
+ENVS, STEPS, CONTROL_STEP = 8, 4, 0.02
+
+
+@dataclass
+class Faulty:
+    """The C engine, but an environment with a negative friction blows up; its next episode draws a healthy one."""
+
+    engine: Engine
+
+    def step(self, state, parameters, target, wrench):
+        healthy = dataclasses.replace(parameters, foot_friction=jnp.maximum(parameters.foot_friction, 0.3))
+        physics, bodies = self.engine.step(state, healthy, target, wrench)
+        qpos = jnp.where(parameters.foot_friction[:, None] < 0, jnp.nan, physics.qpos)
+        return dataclasses.replace(physics, qpos=qpos), bodies
+
+    def forward(self, state, parameters, mask, bodies):
+        return self.engine.forward(state, parameters, mask, bodies)
+
+
+@dataclass
+class Run:
+    env: Environment
+    assets: Assets
+    start: Callable[[], TrainState]
+    iterate: Callable
+    collect: Callable
+
+
+@pytest.fixture(scope="module")
+def run(robot, library, tiny_config) -> Run:
+    """A tiny run that forgets `turn`, compiled once. The wrench is on, so that it is compiled too."""
+    unlearn = dataclasses.replace(tiny_config.unlearn, targets=("turn",))
+    config = dataclasses.replace(
+        unlearning_config(tiny_config, unlearn), wrench=dataclasses.replace(tiny_config.wrench, max_gain=0.6)
+    )
+    engine = Faulty(NativeEngine(robot, config.physics.substeps, ENVS))
+    env = Environment(config, robot, engine, ENVS, noisy=True)
+    assets = make_assets(config, robot, library)
+    begin = jax.jit(lambda assets, key: init_state(env, assets, key))
+    return Run(
+        env=env,
+        assets=assets,
+        start=lambda: begin(assets, jax.random.PRNGKey(0)),
+        iterate=make_iteration(env),
+        collect=jax.jit(lambda assets, state: collect(env, assets, state)),
+    )
+
+
+@pytest.fixture(scope="module")
+def trajectory(run) -> Trajectory:
+    return jax.device_get(run.collect(run.assets, run.start())[1])
+
+
+def finite(tree) -> bool:
+    return all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(tree))
+
+
+def test_three_iterations_compile_once(run):
+    state = run.start()
+    for _ in range(3):
+        state, _ = run.iterate(run.assets, state)
+    assert run.iterate._cache_size() == 1
+    assert int(state.iteration) == 3
+
+
+def test_an_iteration_keeps_every_shape_and_type(run):
+    before = jax.tree.map(lambda x: (x.shape, x.dtype, x.weak_type), run.start())
+    after = jax.tree.map(lambda x: (x.shape, x.dtype, x.weak_type), run.iterate(run.assets, run.start())[0])
+    assert before == after
+
+
+def test_the_same_state_gives_the_same_iteration(run):
+    first, second = (jax.device_get(run.iterate(run.assets, run.start())) for _ in range(2))
+    for one, two in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True):
+        np.testing.assert_array_equal(one, two)
+
+
+def test_the_state_is_donated_and_the_assets_are_not(run):
+    state = run.start()
+    run.iterate(run.assets, state)
+    assert all(leaf.is_deleted() for leaf in jax.tree.leaves(state.policy))
+    assert not any(leaf.is_deleted() for leaf in jax.tree.leaves(run.assets))
+
+
+def test_an_iteration_learns_and_normalises(run):
+    before = jax.device_get(run.start())
+    after, metrics = jax.device_get(run.iterate(run.assets, run.start()))
+    for old, new in zip(
+        jax.tree.leaves((before.policy.actor, before.policy.critic)),
+        jax.tree.leaves((after.policy.actor, after.policy.critic)),
+        strict=True,
+    ):
+        assert (old != new).any()
+    assert after.policy.actor_normalizer.count == after.policy.critic_normalizer.count == ENVS * STEPS
+    assert finite(metrics)
+    assert float(metrics["learning_rate"]) == float(before.learning_rate)  # the cpu preset's rate is fixed
+
+
+def test_a_diverged_environment_is_counted_and_reaches_neither_metrics_nor_networks(run):
+    state = run.start()
+    friction = state.env.parameters.foot_friction.at[3].set(-1.0)
+    parameters = dataclasses.replace(state.env.parameters, foot_friction=friction)
+    state = dataclasses.replace(state, env=dataclasses.replace(state.env, parameters=parameters))
+    state, metrics = jax.device_get(run.iterate(run.assets, state))
+    assert int(metrics["diverged"]) == int(state.diverged) == 1
+    assert int(metrics["clip/episodes"].sum()) >= 1
+    assert finite(metrics)
+    assert finite(state)
+    assert (state.env.parameters.foot_friction > 0).all()
+
+
+def test_correlated_noise_is_standard_normal_and_remembers_the_step_before():
+    steps = [jax.random.normal(jax.random.PRNGKey(0), (20_000,))]
+    for step in range(3):
+        steps.append(correlated_noise(steps[-1], jax.random.PRNGKey(step + 1), 0.8))
+    np.testing.assert_allclose(np.cov(steps), [[0.8 ** abs(i - j) for i in range(4)] for j in range(4)], atol=0.03)
+    assert stats.kstest(np.asarray(steps[-1]), "norm").pvalue > 1e-3
+
+
+def test_collected_actions_have_the_density_of_the_policy(run, trajectory):
+    std = run.env.config.ppo.initial_std
+    expected = stats.norm(trajectory.mean, std).logpdf(trajectory.action).sum(-1)
+    np.testing.assert_allclose(trajectory.log_prob, expected, rtol=1e-4)
+    assert (trajectory.action - trajectory.mean).std() == pytest.approx(std, rel=0.1)
+
+
+def test_the_value_of_the_state_reached_is_the_next_steps_value_until_the_episode_ends(trajectory):
+    goes_on = ~(trajectory.terminated | trajectory.truncated)[:-1]
+    np.testing.assert_allclose(trajectory.next_value[:-1][goes_on], trajectory.value[1:][goes_on], atol=1e-4)
+
+
+def test_the_training_reward_is_per_control_step_and_turned_round_on_target_steps(trajectory):
+    on_target = trajectory.clip == 1
+    assert 0 < on_target.sum() < on_target.size
+    per_second = trajectory.tracking + trajectory.regularisation - 16.0 * trajectory.normalized_tracking * on_target
+    np.testing.assert_allclose(trajectory.reward, CONTROL_STEP * per_second, rtol=1e-5, atol=1e-6)
+
+
+def test_the_gain_of_an_untrained_bin_is_the_largest(trajectory):
+    np.testing.assert_allclose(trajectory.wrench_gain, 0.6)
+
+
+@pytest.fixture(scope="module")
+def problem(robot, tiny_config, run):
+    """One gradient step on an invented batch: config with one epoch and one mini-batch, state, batch."""
+    ppo = dataclasses.replace(tiny_config.ppo, epochs=1, minibatches=1, learning_rate=1e-3)
+    config = dataclasses.replace(tiny_config, ppo=ppo)
+    rng = np.random.default_rng(0)
+    policy = init_policy(config, robot.num_joints, 5, 7, jax.random.PRNGKey(1))
+    policy = dataclasses.replace(
+        policy,
+        actor_normalizer=Normalizer(jnp.full(5, 2.0), jnp.full(5, 4.0), jnp.float32(100.0)),
+        critic_normalizer=Normalizer(jnp.full(7, -1.0), jnp.full(7, 0.25), jnp.float32(100.0)),
+    )
+    observation = jnp.asarray(rng.normal(2.0, 2.0, (STEPS, ENVS, 5)), jnp.float32)
+    privileged = jnp.asarray(rng.normal(-1.0, 0.5, (STEPS, ENVS, 7)), jnp.float32)
+    mean = jax.jit(make_actor(config, 29).apply)(policy.actor, (observation - 2.0) / 2.0)[0]
+    action = mean + 0.5 * jnp.asarray(rng.standard_normal((STEPS, ENVS, 29)), jnp.float32)
+    value = jax.jit(make_critic(config).apply)(policy.critic, (privileged + 1.0) / 0.5)
+    batch = dict(
+        actor_observation=observation,
+        critic_observation=privileged,
+        action=action,
+        log_prob=jnp.asarray(stats.norm(mean, 0.5).logpdf(action).sum(-1), jnp.float32),
+        mean=mean,
+        value=value,
+    )
+    optimizer = make_optimizer(config).init((policy.actor, policy.critic))
+    state = dataclasses.replace(run.start(), policy=policy, optimizer=optimizer, learning_rate=jnp.float32(1e-3))
+    advantage, target = (jnp.asarray(rng.standard_normal((STEPS, ENVS)), jnp.float32) for _ in range(2))
+    return SimpleNamespace(config=config, robot=robot), state, batch, advantage, target
+
+
+def improved(env, state, batch: dict, advantage, target):
+    """`improve`, compiled."""
+
+    def function(state, batch, advantage, target):
+        return improve(env, state, SimpleNamespace(**batch), advantage, target)
+
+    return jax.jit(function)(state, batch, advantage, target)
+
+
+def test_the_first_gradient_step_is_adams_on_rsl_rls_loss(problem):
+    env, state, batch, advantage, target = problem
+    scaled = (advantage - advantage.mean()) / advantage.std()
+    old_log_prob, old_value = batch["log_prob"], batch["value"]
+
+    def loss(parameters):
+        mean, log_std = make_actor(env.config, 29).apply(parameters[0], (batch["actor_observation"] - 2.0) / 2.0)
+        value = make_critic(env.config).apply(parameters[1], (batch["critic_observation"] + 1.0) / 0.5)
+        log_prob = jax.scipy.stats.norm.logpdf(batch["action"], mean, jnp.exp(log_std)).sum(-1)
+        ratio = jnp.exp(log_prob - old_log_prob)
+        surrogate = jnp.maximum(-scaled * ratio, -scaled * jnp.clip(ratio, 0.8, 1.2)).mean()
+        clipped = old_value + jnp.clip(value - old_value, -0.2, 0.2)
+        value_loss = jnp.maximum((value - target) ** 2, (clipped - target) ** 2).mean()
+        entropy = (0.5 * jnp.log(2 * jnp.pi * jnp.e) + log_std).sum()
+        return surrogate + 1.0 * value_loss - 0.005 * entropy
+
+    gradient = jax.jit(jax.grad(loss))((state.policy.actor, state.policy.critic))
+    norm = float(np.sqrt(sum(float((leaf**2).sum()) for leaf in jax.tree.leaves(gradient))))
+    after, metrics = improved(env, state, batch, advantage, target)
+    assert float(metrics["gradient_norm"]) == pytest.approx(norm, rel=1e-3)
+    changes = jax.tree.map(lambda new, old: new - old, (after.policy.actor, after.policy.critic),
+                           (state.policy.actor, state.policy.critic))  # fmt: skip
+    for change, slope in zip(jax.tree.leaves(changes), jax.tree.leaves(gradient), strict=True):
+        slope = np.asarray(slope) / max(norm, 1.0)
+        clear = np.abs(slope) > 1e-5  # Adam's first step is lr · g / (|g| + 1e-8)
+        np.testing.assert_allclose(np.asarray(change)[clear], -1e-3 * np.sign(slope[clear]), rtol=5e-3)
+
+
+def test_the_normalisers_learn_the_batch_after_the_update(problem):
+    env, state, batch, advantage, target = problem
+    after, _ = improved(env, state, batch, advantage, target)
+    count = STEPS * ENVS
+    expected = (100 * 2.0 + np.asarray(batch["actor_observation"]).sum((0, 1))) / (100 + count)
+    np.testing.assert_allclose(after.policy.actor_normalizer.mean, expected, rtol=1e-5)
+    assert float(after.policy.critic_normalizer.count) == 100 + count
+
+
+def test_the_adaptive_schedule_slows_down_when_the_policy_moves_too_far(problem):
+    env, state, batch, advantage, target = problem
+    ppo = dataclasses.replace(env.config.ppo, schedule="adaptive", epochs=4, learning_rate=1e-2)
+    far = SimpleNamespace(config=dataclasses.replace(env.config, ppo=ppo), robot=env.robot)
+    after, metrics = improved(
+        far, dataclasses.replace(state, learning_rate=jnp.float32(1e-2)), batch, advantage, target
+    )
+    assert float(metrics["kl_final"]) > 0.02
+    assert float(after.learning_rate) < 1e-2
+
+
+def test_ended_episodes_and_steps_are_counted_clip_by_clip(run):
+    flat = np.zeros((2, 3))
+    done = np.array([[0, 1, 0], [0, 0, 1]], bool)
+    trajectory = Trajectory(
+        **dict.fromkeys(("actor_observation", "critic_observation", "action", "log_prob", "mean", "next_value"), flat),
+        value=np.full((2, 3), 4.0),
+        reward=np.full((2, 3), 0.5),
+        tracking=np.array([[8.0, 4.0, 4.0], [8.0, 2.0, 6.0]]),
+        regularisation=np.full((2, 3), 0.5),
+        normalized_tracking=np.array([[1.0, 0.5, 0.5], [1.0, 0.25, 0.75]]),
+        terminated=np.array([[0, 1, 0], [0, 0, 0]], bool),
+        truncated=np.array([[0, 0, 0], [0, 0, 1]], bool),
+        diverged=np.zeros((2, 3), bool),
+        clip=np.array([[0, 1, 1], [0, 0, 1]]),
+        start_bin=np.zeros((2, 3), int),
+        failure=np.where(done, [[0, 0.9, 0], [0, 0, 0.2]], 0.5),
+        steps=np.array([[10, 7, 20], [11, 1, 21]]),
+        wrench_gain=flat,
+        causes={"anchor_height": np.array([[0, 1, 0], [0, 0, 0]], bool)},
+    )
+    trajectory = jax.tree.map(jnp.asarray, trajectory)
+    state = run.start()
+    level = np.asarray(state.failure_level)
+    state, metrics = jax.device_get(learn_sampler(run.env, run.assets, state, trajectory, {}))
+    np.testing.assert_array_equal(metrics["clip/steps"], [3, 3])
+    np.testing.assert_array_equal(metrics["clip/episodes"], [0, 2])
+    np.testing.assert_array_equal(metrics["clip/episode_length_sum"], [0, 28])
+    np.testing.assert_array_equal(metrics["clip/completed"], [0, 1])
+    np.testing.assert_allclose(metrics["clip/survival_weighted_sum"], [0.0, 0.1 + 0.8], rtol=1e-6)
+    np.testing.assert_allclose(metrics["clip/tracking_sum"], [2.25, 1.75])
+    assert metrics["episode_length"] == 14.0
+    assert metrics["completed"] == 0.5
+    assert metrics["terminated/anchor_height"] == 1
+    assert metrics["target/R_track"] == pytest.approx(14.0 / 3)
+    assert metrics["kept/R_track"] == pytest.approx(18.0 / 3)
+    assert metrics["target/lambda_crit"] == pytest.approx(8.0 * (1 + 0.5 / (14.0 / 3)))
+    keep = 0.995**2
+    np.testing.assert_allclose(state.failure_level[1, 0], keep * level[1, 0] + (1 - keep) * 0.55, rtol=1e-5)
+    np.testing.assert_array_equal(state.failure_level[0], level[0])
