@@ -12,7 +12,7 @@ from scipy import stats
 from forgetmimic_jax.physics import Engine
 from forgetmimic_jax.physics.native import NativeEngine
 from forgetmimic_jax.ppo.network import Normalizer
-from forgetmimic_jax.ppo.update import Trajectory, collect, correlated_noise, improve, learn_sampler, make_iteration
+from forgetmimic_jax.ppo.update import Trajectory, collect, improve, learn_sampler, make_iteration
 from forgetmimic_jax.state import TrainState, init_policy, init_state, make_actor, make_critic, make_optimizer
 from forgetmimic_jax.tracking.env import Assets, Environment, make_assets
 from forgetmimic_jax.unlearning.antireward import unlearning_config
@@ -126,14 +126,6 @@ def test_a_diverged_environment_is_counted_and_reaches_neither_metrics_nor_netwo
     assert finite(metrics)
     assert finite(state)
     assert (state.env.parameters.foot_friction > 0).all()
-
-
-def test_correlated_noise_is_standard_normal_and_remembers_the_step_before():
-    steps = [jax.random.normal(jax.random.PRNGKey(0), (20_000,))]
-    for step in range(3):
-        steps.append(correlated_noise(steps[-1], jax.random.PRNGKey(step + 1), 0.8))
-    np.testing.assert_allclose(np.cov(steps), [[0.8 ** abs(i - j) for i in range(4)] for j in range(4)], atol=0.03)
-    assert stats.kstest(np.asarray(steps[-1]), "norm").pvalue > 1e-3
 
 
 def test_collected_actions_have_the_density_of_the_policy(run, trajectory):
