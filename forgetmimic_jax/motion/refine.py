@@ -14,6 +14,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 from scipy.linalg import solveh_banded
+from scipy.optimize import nnls
 from scipy.spatial.transform import Rotation
 
 from forgetmimic_jax.motion.contact import FloorPoints, HumanContact
@@ -21,6 +22,10 @@ from forgetmimic_jax.motion.kinematics import PlanarTransform, rotation
 from forgetmimic_jax.motion.retarget import Targets
 from forgetmimic_jax.robot import Robot
 
+RADIUS = 0.3  # m, over which a moment counts as a force
+FRICTION = 0.7
+TOUCHING = 0.02  # m above the floor
+SURE = 3.0  # m/s^2: beyond it a missing acceleration counts linearly, so that an impact does not bend the motion
 SEAM_SECONDS = 0.12  # half width of the more smoothed seam
 GRAVITY = np.array([0.0, 0.0, -9.81])
 
@@ -35,7 +40,7 @@ class Weights:
     stance_height: float = 40.0  # per m of a planted sole point off the floor
     stance_slip: float = 150.0  # per m a planted sole point moves in one frame
     floor: float = 60.0  # per m below the floor, or below the clearance of a sole that swings
-    flight: float = 0.04  # per m/s^2 of the centre of mass off free fall
+    wrench: float = 0.05  # per m/s^2 of acceleration that the floor cannot provide
     limit: float = 20.0  # per rad beyond the joint's limit less its margin
     speed: float = 0.3  # per rad/s beyond the share of the motor's speed
     smooth_hz: float = 6.0  # jerk is weighed so that motion faster than this is smoothed away
@@ -52,6 +57,7 @@ class Pose(NamedTuple):
     turns_jac: np.ndarray  # [frame, body, 3, nv] world-frame rotation
     com: np.ndarray  # [frame, 3] m
     com_jac: np.ndarray  # [frame, 3, nv]
+    momentum: np.ndarray  # [frame, 3, nv] matrix of the angular momentum about the centre of mass
 
 
 class Term(NamedTuple):
@@ -143,6 +149,7 @@ class _Problem:
         pose = self.pose(qpos)
         yield from self.imitation(qpos, pose)
         yield from self.contacts(pose)
+        yield from self.floor_wrench(qpos, pose)
         yield from self.joint_bounds(qpos)
         yield from self.smoothness(qpos)
 
@@ -158,6 +165,7 @@ class _Problem:
             np.empty((self.frames, bodies, 3, 3)),
             np.empty((self.frames, bodies, 3, model.nv)),
             np.empty((self.frames, 3)),
+            np.empty((self.frames, 3, model.nv)),
             np.empty((self.frames, 3, model.nv)),
         )
         for frame in range(self.frames):
@@ -175,6 +183,7 @@ class _Problem:
                 mujoco.mj_jac(model, data, pose.points_jac[frame, bodies + row], None, point, body)
             pose.com[frame] = data.subtree_com[1]
             mujoco.mj_jacSubtreeCom(model, data, pose.com_jac[frame], 1)
+            mujoco.mj_angmomMat(model, data, pose.momentum[frame], 1)
         pose.points[:, bodies:, 2] -= self.floor.radius
         return pose
 
@@ -235,18 +244,49 @@ class _Problem:
             },
         )
 
-        first, last = self._frames_with(2)
-        middle = (first + 1) % self.frames
-        flying = self.contact.flight[first] & self.contact.flight[middle] & self.contact.flight[last]
-        first = first[flying]
+    def floor_wrench(self, qpos: np.ndarray, pose: Pose) -> Iterator[Term]:
+        """Newton's and Euler's laws: what accelerates the body must come from the floor points that touch.
+
+        Per unit of mass, [force; moment about the centre of mass over RADIUS] in m/s^2. The floor's best answer, by
+        non-negative least squares over each point's friction pyramid, is subtracted; a body in flight gets none, so
+        that it falls freely and keeps its angular momentum.
+        """
+        here, ahead = self._frames_with(1)
+        change, before, after = self._changes(qpos)
+        momentum = 0.5 * (pose.momentum[here] + pose.momentum[ahead])
+        spin = np.einsum("tij,tj->ti", momentum, change)
+        first, _ = self._frames_with(2)
+        second = (first + 1) % self.frames
         com_1, jac_1 = self._ahead(pose.com[:, None], pose.com_jac[:, None], first, 1)
         com_2, jac_2 = self._ahead(pose.com[:, None], pose.com_jac[:, None], first, 2)
-        scale = self.weights.flight * self.fps**2
-        fall = com_2[:, 0] - 2.0 * com_1[:, 0] + pose.com[first] - GRAVITY / self.fps**2
+        bodies = self.robot.model.nbody
+        points, _ = self._ahead(pose.points[:, bodies:], None, first, 1)
+
+        force = (com_2[:, 0] - 2.0 * com_1[:, 0] + pose.com[first]) * self.fps**2 - GRAVITY
+        mass = self.robot.model.body_subtreemass[1]
+        rate = self.fps**2 / (mass * RADIUS)
+        needed = np.concatenate([force, rate * (spin[second] - spin[first])], axis=-1)
+        given, project = _floor_answer(
+            needed, points - com_1, (points[..., 2] < TOUCHING) & ~self.contact.flight[second, None]
+        )
+        missing = needed - given
+        robust = self.weights.wrench * (1.0 + np.sum(missing**2, axis=-1) / SURE**2) ** -0.25
+        lever = -_skew(given[:, :3]) / RADIUS @ jac_1[:, 0]
+        blocks = {
+            0: (self.fps**2 * pose.com_jac[first], -rate * momentum[first] @ before[first]),
+            1: (
+                -2.0 * self.fps**2 * jac_1[:, 0],
+                lever + rate * (momentum[second] @ before[second] - momentum[first] @ after[first]),
+            ),
+            2: (self.fps**2 * jac_2[:, 0], rate * momentum[second] @ after[second]),
+        }
         yield Term(
             first,
-            scale * fall,
-            {0: scale * pose.com_jac[first], 1: -2.0 * scale * jac_1[:, 0], 2: scale * jac_2[:, 0]},
+            robust[:, None] * missing,
+            {
+                offset: robust[:, None, None] * (project @ np.concatenate(block, axis=1))
+                for offset, block in blocks.items()
+            },
         )
 
     def joint_bounds(self, qpos: np.ndarray) -> Iterator[Term]:
@@ -268,6 +308,23 @@ class _Problem:
 
     def smoothness(self, qpos: np.ndarray) -> Iterator[Term]:
         """Third differences of the root's and the joints' motion."""
+        change, before, after = self._changes(qpos)
+        first, _ = self._frames_with(3)
+        rows = [(first + offset) % self.frames for offset in range(3)]
+        jerk = change[rows[2]] - 2.0 * change[rows[1]] + change[rows[0]]
+        jacobians = {
+            0: before[rows[0]],
+            1: after[rows[0]] - 2.0 * before[rows[1]],
+            2: -2.0 * after[rows[1]] + before[rows[2]],
+            3: after[rows[2]],
+        }
+        weight = self._smoothing(first)
+        yield Term(
+            first, weight * jerk, {offset: weight[..., None] * jacobian for offset, jacobian in jacobians.items()}
+        )
+
+    def _changes(self, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Tangent steps [row, nv] from each frame to the next, and their Jacobians over both [row, nv, nv]."""
         nv = self.robot.model.nv
         here, ahead = self._frames_with(1)
         pos_ahead, _ = self._ahead(qpos[:, None, :3], None, here, 1)
@@ -288,20 +345,7 @@ class _Problem:
         before[:, 3:6, 3:6] += half
         if self.step is not None:
             after[-1, :3, :3] = _yaw_matrix(self.step.yaw)
-
-        first, _ = self._frames_with(3)
-        rows = [(first + offset) % self.frames for offset in range(3)]
-        jerk = change[rows[2]] - 2.0 * change[rows[1]] + change[rows[0]]
-        jacobians = {
-            0: before[rows[0]],
-            1: after[rows[0]] - 2.0 * before[rows[1]],
-            2: -2.0 * after[rows[1]] + before[rows[2]],
-            3: after[rows[2]],
-        }
-        weight = self._smoothing(first)
-        yield Term(
-            first, weight * jerk, {offset: weight[..., None] * jacobian for offset, jacobian in jacobians.items()}
-        )
+        return change, before, after
 
     def _smoothing(self, first: np.ndarray) -> np.ndarray:
         """Weight [row, 1] of the third differences that start at frame `first`, larger about a seam."""
@@ -340,6 +384,26 @@ class _Problem:
             if jac is not None:
                 jac_ahead[past] = _yaw_matrix(self.step.yaw) @ jac_ahead[past]
         return pos_ahead, jac_ahead
+
+
+def _floor_answer(needed: np.ndarray, levers: np.ndarray, touching: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The wrench nearest to `needed` [row, 6] that the touching points give, and the projector [row, 6, 6] off it.
+
+    levers [row, point, 3] m: the points from the centre of mass; touching bool[row, point].
+    """
+    edges = np.array([[FRICTION, 0, 1], [-FRICTION, 0, 1], [0, FRICTION, 1], [0, -FRICTION, 1]])
+    given = np.zeros_like(needed)
+    project = np.tile(np.eye(6), (len(needed), 1, 1))
+    for row in np.flatnonzero(touching.any(axis=1)):
+        arms = np.repeat(levers[row, touching[row]], len(edges), axis=0)
+        forces = np.tile(edges, (len(arms) // len(edges), 1))
+        columns = np.concatenate([forces, np.cross(arms, forces) / RADIUS], axis=1).T
+        share, _ = nnls(columns, needed[row])
+        given[row] = columns @ share
+        active = columns[:, share > 0.0]
+        if active.size:
+            project[row] -= active @ np.linalg.pinv(active)
+    return given, project
 
 
 def _cost(terms: list[Term]) -> float:
