@@ -154,7 +154,8 @@ def test_the_gain_of_an_untrained_bin_is_the_largest(trajectory):
 @pytest.fixture(scope="module")
 def problem(robot, tiny_config, run):
     """One gradient step on an invented batch: config with one epoch and one mini-batch, state, batch."""
-    ppo = dataclasses.replace(tiny_config.ppo, epochs=1, minibatches=1, learning_rate=1e-3)
+    ppo = dataclasses.replace(tiny_config.ppo, schedule="fixed", entropy_cost=0.005, initial_std=0.5)
+    ppo = dataclasses.replace(ppo, epochs=1, minibatches=1)
     config = dataclasses.replace(tiny_config, ppo=ppo)
     rng = np.random.default_rng(0)
     policy = init_policy(config, robot.num_joints, 5, 7, jax.random.PRNGKey(1))
