@@ -6,6 +6,7 @@ run to another. `run/` holds all the rest of the TrainState, for resuming; a shi
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -91,6 +92,7 @@ def save_checkpoint(
     temporary = path.with_name(f".{path.name}.tmp")
     try:
         temporary.mkdir(parents=True)
+        _check_space(temporary, trees)
         with ocp.StandardCheckpointer() as checkpointer:
             for name, tree in trees.items():
                 checkpointer.save((temporary / name).resolve(), tree)
@@ -241,6 +243,15 @@ def _restore(path: Path, part: str, template: Any) -> Any:
             name = jax.tree_util.keystr(where, simple=True, separator=".")
             raise InputError(f"{path / part}: {name}: found shape {list(found.shape)}; {list(asked.shape)} is needed")
     return restored
+
+
+def _check_space(folder: Path, trees: Any) -> None:
+    """OSError, as the system would say it, unless the trees fit on the disk: Orbax's threads say it in many lines."""
+    needed = sum(leaf.nbytes for leaf in jax.tree.leaves(trees)) + 2**20  # 1 MiB for what describes them
+    if shutil.disk_usage(folder).free < needed:
+        raise OSError(
+            errno.ENOSPC, f"{os.strerror(errno.ENOSPC)}: {needed / 2**20:.0f} MiB are needed", str(folder.parent)
+        )
 
 
 def _hashes(folder: Path) -> dict[str, str]:

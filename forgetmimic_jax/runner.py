@@ -8,6 +8,7 @@ import json
 import os
 import shutil
 import signal
+import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from tensorboardX.event_file_writer import EventsWriter
+from tensorboardX.proto.event_pb2 import Event, SessionLog
+from tensorboardX.proto.summary_pb2 import Summary
 from forgetmimic_jax import checkpoint
 from forgetmimic_jax.config import Config, save_config, validate
 from forgetmimic_jax.console import progress
@@ -265,12 +269,14 @@ class _Log:
     """metrics.jsonl and TensorBoard events: means over the iterations since the last row."""
 
     def __init__(self, directory: Path, iteration: int, environment_steps: int):
-        from tensorboardX import SummaryWriter
-
+        # TensorboardX's SummaryWriter writes from a thread, for which a run would wait forever when the disk is full.
         path = directory / "metrics.jsonl"
         _drop_rows_after(path, iteration)
         self._file = path.open("a")
-        self._events = SummaryWriter(str(directory / "events"), purge_step=environment_steps + 1)
+        (directory / "events").mkdir(exist_ok=True)
+        self._events = EventsWriter(str(directory / "events" / "events"))
+        # TensorBoard hides the rows after this one that an earlier, killed process may have written.
+        self._write_event(environment_steps + 1, session_log=SessionLog(status=SessionLog.START))
         self._rows: list[Mapping[str, np.ndarray]] = []
 
     def __enter__(self) -> _Log:
@@ -306,12 +312,14 @@ class _Log:
         }
         self._file.write(json.dumps(out) + "\n")
         self._file.flush()
-        for name, value in out.items():
-            if isinstance(value, float):
-                self._events.add_scalar(name, value, environment_steps)
+        scalars = {name: value for name, value in out.items() if isinstance(value, float)}
         for clip, values in out["clips"].items():
-            for name, value in values.items():
-                self._events.add_scalar(f"{clip}/{name}", value, environment_steps)
+            scalars |= {f"{clip}/{name}": value for name, value in values.items()}
+        summary = Summary(value=[Summary.Value(tag=name, simple_value=value) for name, value in scalars.items()])
+        self._write_event(environment_steps, summary=summary)
+
+    def _write_event(self, step: int, **content: Any) -> None:
+        self._events.write_event(Event(wall_time=time.time(), step=step, **content))
         self._events.flush()
 
 
