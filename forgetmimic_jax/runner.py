@@ -17,14 +17,16 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-
+from rich.console import Console
 from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto.event_pb2 import Event, SessionLog
 from tensorboardX.proto.summary_pb2 import Summary
+
 from forgetmimic_jax import checkpoint
 from forgetmimic_jax.config import Config, save_config, validate
 from forgetmimic_jax.console import progress
 from forgetmimic_jax.errors import InputError, Interrupted, nearest
+from forgetmimic_jax.evaluation.watch import Watch
 from forgetmimic_jax.motion.clip import write_atomically
 from forgetmimic_jax.motion.library import DATA_DIR, MotionLibrary, library_hash, load_library, read_manifest
 from forgetmimic_jax.ppo.update import make_iteration
@@ -33,6 +35,7 @@ from forgetmimic_jax.state import TrainState, init_state
 from forgetmimic_jax.tracking.env import Assets, Environment, make_assets, make_environment
 
 COMPILATION_CACHE = DATA_DIR.parent / ".cache" / "jax"  # what XLA compiled is not compiled again at the next start
+BEST = "best"
 KEEP = 2  # newest checkpoints kept beside the named ones
 LOG_EVERY = 10  # iterations averaged into one row of metrics.jsonl
 
@@ -189,7 +192,8 @@ def run(
     """Train until `config.iterations`; returns the last checkpoint's folder and the state.
 
     The folder gets config.yaml, metrics.jsonl (means over LOG_EVERY iterations), TensorBoard events and checkpoints/,
-    the first of them before the first iteration, so that a run that is killed can always go on.
+    the first of them before the first iteration, so that a run that is killed can always go on. With
+    `config.evaluate_every` also evaluations.jsonl and best/, the policy with the best mean survival-weighted tracking.
     Ctrl-C and SIGTERM end the current iteration, save, and raise Interrupted.
     """
     config = setup.config
@@ -202,14 +206,22 @@ def run(
     steps_per_iteration = config.ppo.num_envs * config.ppo.num_steps
     iterate = make_iteration(setup.env)
     directory.mkdir(parents=True, exist_ok=True)
+    console = Console()
     saved = newest
 
-    def save() -> Path:
+    def save(best: bool = False) -> Path:
         # A row never spans a checkpoint: what is resumed has all of its rows in the file.
         log.write(iteration, environment_steps, setup.library.names)
-        path = directory / "checkpoints" / f"{iteration:08d}"
+        path = directory / BEST if best else directory / "checkpoints" / f"{iteration:08d}"
         checkpoint.save_checkpoint(
-            path, state, config, setup.robot, setup.library, setup.library_hash, environment_steps=environment_steps
+            path,
+            state,
+            config,
+            setup.robot,
+            setup.library,
+            setup.library_hash,
+            environment_steps=environment_steps,
+            resumable=not best,
         )
         for old in checkpoint.checkpoints(directory)[:-KEEP]:
             shutil.rmtree(old)
@@ -220,8 +232,9 @@ def run(
         with (
             _Log(directory, iteration, environment_steps) as log,
             _stop_requests() as stop,
-            progress(description, config.iterations, start=iteration) as report,
+            progress(description, config.iterations, start=iteration, console=console) as report,
         ):
+            watch = _watch(setup, directory, iteration)
             saved = saved or save()
             while iteration < config.iterations and not stop:
                 state, metrics = iterate(setup.assets, state)
@@ -234,6 +247,10 @@ def run(
                 report(iteration, environment_steps, _live(metrics))
                 if iteration % config.checkpoint_every == 0:
                     saved = save()
+                if watch and iteration % config.evaluate_every == 0:
+                    if watch(state.policy, iteration, environment_steps):
+                        save(best=True)
+                    console.print(watch.table())
             if int(saved.name) != iteration:
                 saved = save()
     except BaseException as error:
@@ -245,6 +262,12 @@ def run(
     if stop:
         raise interrupted(config, directory)
     return saved, state
+
+
+def _watch(setup: Setup, directory: Path, iteration: int) -> Watch | None:
+    if not setup.config.evaluate_every:
+        return None
+    return Watch(setup.config, setup.robot, setup.library, directory, iteration)
 
 
 def _saved_state(setup: Setup, path: Path) -> tuple[TrainState, int]:

@@ -111,7 +111,7 @@ def _config_of_new_run(options: Options) -> Config:
         # The network is the base's: it is what unlearning starts from.
         layers: dict[str, Any] = {name: getattr(base.ppo, name) for name in ("actor_layers", "critic_layers")}
         config = dataclasses.replace(config, library=base.library, ppo=dataclasses.replace(config.ppo, **layers))
-    config = dataclasses.replace(config, base=None, iterations=ITERATIONS[options.preset or "cpu"])
+    config = dataclasses.replace(config, base=None, evaluate_every=0, iterations=ITERATIONS[options.preset or "cpu"])
     config = replace_given(config, robot=options.robot, seed=options.seed, library=options.library, base=options.base)
     targets = runner.default_targets(config) if options.targets is None else comma_separated(options.targets)
     return unlearning_config(config, UnlearnConfig(targets=targets, penalty=options.penalty))

@@ -1,0 +1,68 @@
+"""A short evaluation now and then during a long run: is it still getting better, clip by clip?"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from forgetmimic_jax.config import Config
+from forgetmimic_jax.evaluation.metrics import episode_metrics
+from forgetmimic_jax.evaluation.rollout import Evaluator
+from forgetmimic_jax.motion.library import MotionLibrary
+from forgetmimic_jax.robot import Robot
+from forgetmimic_jax.state import Policy
+
+FILE = "evaluations.jsonl"
+EPISODES = 6  # a clip: enough to see a trend, not to report
+SHOWN = ("success_rate", "survival_weighted_tracking")
+
+
+class Watch:
+    """Evaluates a run's policy on the same few episodes each time; one row of evaluations.jsonl a time."""
+
+    def __init__(self, config: Config, robot: Robot, library: MotionLibrary, directory: Path, iteration: int):
+        self._evaluator = Evaluator(config, robot, library, episodes=EPISODES, seed=config.seed)
+        self._names = library.names
+        self._path = directory / FILE
+        rows = read_rows(self._path, iteration)
+        self._path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+        self._best = max((row["survival_weighted_tracking"] for row in rows), default=-1.0)
+
+    def __call__(self, policy: Policy, iteration: int, environment_steps: int) -> bool:
+        """Evaluate, add a row; whether this is the best mean survival-weighted tracking so far."""
+        rollout = self._evaluator.rollout(policy)
+        metrics = episode_metrics(rollout)
+        row: dict[str, Any] = {"iteration": iteration, "environment_steps": environment_steps}
+        row |= {name: float(metrics[name].mean()) for name in SHOWN}
+        row["clips"] = {
+            clip: {name: round(float(metrics[name][rollout.clip == i].mean()), 4) for name in SHOWN}
+            for i, clip in enumerate(self._names)
+        }
+        with self._path.open("a") as file:
+            file.write(json.dumps(row) + "\n")
+        better = row["survival_weighted_tracking"] > self._best
+        self._best = max(self._best, row["survival_weighted_tracking"])
+        return better
+
+    def table(self) -> Any:
+        """Success of every clip over the last evaluations, for the terminal."""
+        from rich.table import Table
+
+        rows = read_rows(self._path)[-8:]
+        table = Table(title="success (survival-weighted tracking) by environment steps", title_justify="left", box=None)
+        table.add_column("clip")
+        for row in rows:
+            table.add_column(f"{row['environment_steps'] / 1e6:.1f}M", justify="right")
+        for clip in self._names:
+            cells = [row["clips"][clip] for row in rows]
+            table.add_row(clip, *(f"{c['success_rate']:.0%} ({c['survival_weighted_tracking']:.2f})" for c in cells))
+        return table
+
+
+def read_rows(path: Path, up_to: int | None = None) -> list[dict[str, Any]]:
+    """The rows of evaluations.jsonl, those after iteration `up_to` left out (they will be made again)."""
+    if not path.exists():
+        return []
+    rows = [json.loads(line) for line in path.read_text().splitlines()]
+    return [row for row in rows if up_to is None or row["iteration"] <= up_to]
