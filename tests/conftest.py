@@ -2,10 +2,8 @@
 
 import dataclasses
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -73,14 +71,6 @@ def tiny_config() -> Config:
             critic_layers=(16,),
         ),
     )
-
-
-@pytest.fixture(scope="module")
-def fast_compile() -> Iterator[None]:
-    """Compile without XLA's optimisations: a third less time to compile what a test runs only a few times."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
 
 
 @pytest.fixture(scope="session")

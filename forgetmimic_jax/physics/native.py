@@ -99,7 +99,8 @@ class NativeEngine:
 
     def _step_host(self, arguments) -> tuple[np.ndarray, ...]:
         *state, friction, torso_com, target, wrench = (np.asarray(x) for x in arguments)
-        with self._lock:
+        # What overflows float32 has diverged, and shows as infinity: no warning on the user's screen.
+        with self._lock, np.errstate(over="ignore"):
             batch = self._batch
             self._load(self._everyone, *state, friction, torso_com)
             batch.ctrl[:] = target

@@ -1,0 +1,197 @@
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from forgetmimic_jax.evaluation.rollout import CHUNK, Evaluator, episode_starts, evaluation_config, step_errors
+from forgetmimic_jax.physics import BodyState
+from forgetmimic_jax.state import Policy, init_policy
+from forgetmimic_jax.tracking.env import StepResult
+from forgetmimic_jax.tracking.observation import actor_size
+from forgetmimic_jax.tracking.reference import lookup
+from forgetmimic_jax.tracking.reward import Reward
+
+EPISODES = 4  # a clip; the library has two
+
+
+@pytest.fixture(scope="module")
+def evaluator(robot, library, tiny_config) -> Evaluator:
+    return Evaluator(tiny_config, robot, library, episodes=EPISODES, seed=0)
+
+
+@pytest.fixture(scope="module")
+def zero_action(evaluator):
+    return evaluator.rollout(None)
+
+
+@pytest.fixture(scope="module")
+def policy(robot, tiny_config) -> Policy:
+    return init_policy(tiny_config, robot.num_joints, actor_size(robot.num_joints), 623, jax.random.PRNGKey(0))
+
+
+def test_half_of_a_clips_episodes_start_at_its_beginning_and_half_are_spread_over_it():
+    clip, frame = episode_starts(np.array([526, 226]), 20, seed=0)
+    np.testing.assert_array_equal(clip, np.repeat([0, 1], 20))
+    for index, span in ((0, 500), (1, 200)):  # a start leaves at least 25 steps
+        starts = frame[clip == index]
+        assert (starts[:10] == 0).all()
+        np.testing.assert_array_equal(np.floor(starts[10:] / (span / 10)), np.arange(10))  # one in each tenth
+
+
+def test_an_episode_keeps_25_steps_where_the_clip_has_them():
+    lengths = np.array([30, 100, 400])
+    clip, frame = episode_starts(lengths, 50, seed=3)
+    assert (lengths[clip] - 1 - frame >= 25).all()
+
+
+def test_a_very_short_clip_starts_at_its_beginning():
+    assert not episode_starts(np.array([2, 20]), 6, seed=0)[1].any()
+
+
+def test_starts_depend_on_the_seed_alone():
+    lengths = np.array([300, 200])
+    first, again, other = (episode_starts(lengths, 10, seed)[1] for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).any()
+
+
+def test_a_single_episode_starts_at_the_beginning():
+    assert not episode_starts(np.array([300]), 1, seed=0)[1].any()
+
+
+def test_evaluation_has_no_randomisation_and_no_wrench_but_the_reset_noise(tiny_config):
+    trained = dataclasses.replace(tiny_config, wrench=dataclasses.replace(tiny_config.wrench, max_gain=0.6))
+    config = evaluation_config(trained)
+    assert config.wrench.max_gain == 0.0
+    assert config.noise == dataclasses.replace(trained.noise, enabled=False)
+
+
+def test_an_episode_can_live_to_its_clips_end(zero_action, library):
+    length = np.asarray(library.length)[zero_action.clip]
+    np.testing.assert_array_equal(zero_action.horizon, length - 1 - zero_action.start_frame)
+    assert zero_action.tracking_reward.shape == (2 * EPISODES, zero_action.horizon.max())
+
+
+def test_the_zero_action_falls_at_last_and_has_tracked_until_then(zero_action):
+    assert (zero_action.length >= 1).all()
+    assert (zero_action.length < zero_action.horizon).any()
+    first = zero_action.tracking_reward[:, 0]
+    assert ((first > 0.3) & (first <= 1.0)).all()
+    assert zero_action.nan_resets == 0
+
+
+def test_the_same_policy_meets_the_same_fate(evaluator, zero_action):
+    again = evaluator.rollout(None)
+    np.testing.assert_array_equal(again.length, zero_action.length)
+    np.testing.assert_array_equal(again.tracking_reward, zero_action.tracking_reward)
+
+
+def test_a_policy_that_outputs_zero_is_the_zero_action(evaluator, zero_action, policy):
+    silent = dataclasses.replace(policy, actor=jax.tree.map(jnp.zeros_like, policy.actor))
+    rollout = evaluator.rollout(silent)  # its standard deviation is 1: sampled actions would be far from zero
+    np.testing.assert_array_equal(rollout.length, zero_action.length)
+    np.testing.assert_allclose(rollout.tracking_reward, zero_action.tracking_reward, atol=1e-6)
+
+
+def test_every_policy_meets_the_same_starts(evaluator, zero_action, policy):
+    biased = jax.tree.map(lambda x: x + 0.1, policy.actor)
+    rollout = evaluator.rollout(dataclasses.replace(policy, actor=biased))
+    for field in ("clip", "start_frame", "horizon"):
+        np.testing.assert_array_equal(getattr(rollout, field), getattr(zero_action, field))
+    assert (rollout.tracking_reward != zero_action.tracking_reward).any()
+
+
+def test_a_policy_changes_the_robot_only_after_its_first_action(evaluator):
+    begin = [evaluator._begin(evaluator._assets, jax.random.PRNGKey(0)) for _ in range(2)]
+    for one, two in zip(*(jax.tree.leaves(state) for state in begin), strict=True):
+        np.testing.assert_array_equal(one, two)
+
+
+def scripted(evaluator: Evaluator, terminated: dict[int, list[int]], diverged: dict[int, list[int]]):
+    """A rollout in which environment `e` breaks a bound, or blows up, at the steps listed; r̄ is the step's number."""
+    envs, chunk = 2 * EPISODES, 0
+
+    def advance(assets, policy, state):
+        nonlocal chunk
+        steps = np.arange(CHUNK) + CHUNK * chunk
+        chunk += 1
+
+        def marks(events: dict[int, list[int]]) -> np.ndarray:
+            return np.stack([np.isin(steps, events.get(env, [])) for env in range(envs)], axis=1)
+
+        broken = marks(terminated) | marks(diverged)
+        reward = np.repeat(steps[:, None], envs, axis=1).astype(np.float32)
+        return state, {"tracking_reward": reward, "terminated": broken, "diverged": marks(diverged)}
+
+    original, evaluator._advance = evaluator._advance, advance
+    try:
+        return evaluator.rollout(None)
+    finally:
+        evaluator._advance = original
+
+
+def test_an_episode_lasts_until_its_first_termination(evaluator):
+    rollout = scripted(evaluator, {0: [7, 9], 1: [60], 2: [0]}, {})
+    np.testing.assert_array_equal(rollout.length[:3], [7, 60, 1])
+    np.testing.assert_array_equal(rollout.length[3:], rollout.horizon[3:])
+    np.testing.assert_array_equal(rollout.tracking_reward[1, :60], np.arange(60))
+
+
+def test_a_fall_in_the_last_step_is_no_success_and_after_the_end_none_counts(evaluator):
+    last = int(scripted(evaluator, {}, {}).horizon[0]) - 1
+    rollout = scripted(evaluator, {0: [last], 1: [last + 1]}, {})
+    assert rollout.length[0] == rollout.horizon[0] - 1
+    assert rollout.length[1] == rollout.horizon[1]
+
+
+def test_episodes_that_blow_up_are_counted_once_each_and_only_while_they_live(evaluator):
+    rollout = scripted(evaluator, {2: [3]}, {0: [5, 6], 1: [10], 2: [8]})
+    assert rollout.nan_resets == 2
+    np.testing.assert_array_equal(rollout.length[:3], [5, 10, 3])
+
+
+def test_step_errors_by_hand(evaluator, robot):
+    """The robot stands 1 m east of the reference, turned by 90°, 2 cm too high, and stands on one foot."""
+    envs = 2 * EPISODES
+    assets, state = evaluator._assets, evaluator._begin(evaluator._assets, jax.random.PRNGKey(0))
+    reference = lookup(assets.library, jnp.zeros(envs, jnp.int32), jnp.full(envs, 10))
+    turn = Rotation.from_euler("z", np.pi / 2)
+    pos = turn.apply(np.asarray(reference.body_pos).reshape(-1, 3)).reshape(reference.body_pos.shape)
+    pos += [1.0, 0.0, 0.02]
+    quat = (turn * Rotation.from_quat(np.asarray(reference.body_quat).reshape(-1, 4), scalar_first=True)).as_quat(
+        scalar_first=True
+    )
+    wrist = robot.key_bodies.index("left_wrist_yaw_link")
+    pos[:, wrist, 2] += 0.08
+    force = np.zeros_like(pos)
+    force[:, robot.feet[0]] = [0.0, 0.0, 150.0]
+    force[:, robot.feet[1]] = [0.0, 0.0, 0.9]
+    bodies = BodyState(*(jnp.asarray(x, jnp.float32) for x in (pos, quat.reshape(*pos.shape[:2], 4), pos, pos, force)))
+    joint_pos = np.array(reference.joint_pos)
+    knee = robot.joint_names.index("left_knee_joint")
+    joint_pos[:, knee] = 2.85  # beyond 0.9 of its range
+    off = joint_pos[0, knee] - float(reference.joint_pos[0, knee])
+    physics = dataclasses.replace(
+        state.physics,
+        qpos=state.physics.qpos.at[:, 7:].set(jnp.asarray(joint_pos)),
+        qvel=state.physics.qvel.at[:, 6:].set(reference.joint_vel + 0.5),
+    )
+    state = dataclasses.replace(state, physics=physics, bodies=bodies)
+    no = jnp.zeros(envs, bool)
+    result = StepResult(Reward(no, no, no, {}), no, no, no, {}, reference)
+    errors = {name: float(x[0]) for name, x in step_errors(evaluator._env, assets, state, result).items()}
+
+    world = np.linalg.norm(pos[0] - np.asarray(reference.body_pos[0]), axis=-1)
+    assert errors["mpkpe"] == pytest.approx(world.mean(), rel=1e-4)
+    assert errors["anchor_position_error"] == pytest.approx(world[robot.anchor], rel=1e-4)
+    assert errors["root_relative_mpkpe"] == pytest.approx((13 * 0.02 + 0.10) / 14, rel=1e-3)
+    assert errors["end_effector_error"] == pytest.approx((3 * 0.02 + 0.10) / 4, rel=1e-3)
+    assert errors["max_key_body_position_error"] == pytest.approx(0.10, rel=1e-3)
+    assert errors["anchor_orientation_error"] == pytest.approx(np.pi / 2, rel=1e-4)
+    assert errors["joint_position_error"] == pytest.approx(off / np.sqrt(29), rel=1e-4)
+    assert errors["joint_velocity_error"] == pytest.approx(0.5, rel=1e-4)
+    assert errors["foot_contact"] == 0.5
+    assert errors["joint_limit_violation"] == pytest.approx(1 / 29)
