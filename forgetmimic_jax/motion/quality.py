@@ -23,7 +23,7 @@ JITTER_HZ = 12.0  # a body's own motion is slower
 MAX_DEPTH = 0.02  # m under the floor, of any shape
 MAX_STANCE_HEIGHT = 0.02  # m of a standing sole off the floor
 MAX_SKATE = 0.10  # m/s
-MAX_SEAM_RATIO = 1.5  # a jump stands out by far more; a step or a landing at the seam reaches 1.2
+MAX_SEAM_RATIO = 1.0
 MAX_JITTER = 0.02
 MAX_FLIGHT_ERROR = 5.0  # m/s^2 from gravity
 

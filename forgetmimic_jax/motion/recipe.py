@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,8 +38,6 @@ class Settings:
     """Time runs by sqrt(scale), so that a flight of scaled height falls with the same gravity."""
     seconds: float = 10.0
     """Length that a cyclic clip is tiled to; one that does not repeat keeps its own."""
-    weights: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """Changes to the refinement's weights."""
 
 
 CLIPS: dict[str, Settings] = {
@@ -86,12 +84,11 @@ def retarget_clip(robot: Robot, path: Path, name: str, settings: Settings) -> Re
     qpos = refine(
         robot,
         targets,
-        human_contact(human, FPS),
+        human_contact(human, FPS * time_scale),  # speeds of the human's own time
         floor_points(robot),
         inverse_kinematics(robot, targets),
         FPS,
         step,
-        weights=dataclasses.replace(Weights(), **settings.weights),
     )
     cycle = Clip(name, FPS, robot.joint_names, qpos[:, :3], quaternion(rotation(qpos[:, 3:7])), qpos[:, 7:])
     clip = cycle if step is None else tile(cycle, step, settings.seconds)
@@ -146,7 +143,7 @@ def retarget_library(
     entries = {}
     for name, result in results.items():
         write_clip(result.clip, output / f"{name}.npz")
-        entries[name] = _entry(result, source_file(source, name), output / f"{name}.npz", CLIPS[name])
+        entries[name] = _entry(result, source_file(source, name), output / f"{name}.npz")
     library.write_manifest(
         output,
         {
@@ -154,13 +151,14 @@ def retarget_library(
             "robot": robot.name,
             "fps": FPS,
             "default_targets": list(DEFAULT_TARGETS),
+            "refinement": dataclasses.asdict(Weights()),
             "clips": entries,
         },
     )
     return output
 
 
-def _entry(result: Retargeted, source: Path, file: Path, settings: Settings) -> dict[str, Any]:
+def _entry(result: Retargeted, source: Path, file: Path) -> dict[str, Any]:
     clip, cycle = result.clip, result.cycle_frames
     return {
         "sha256": library.file_hash(file),
@@ -175,6 +173,5 @@ def _entry(result: Retargeted, source: Path, file: Path, settings: Settings) -> 
         "cycles": None if cycle is None else round(clip.num_frames / cycle, 3),
         "scale": round(result.scale, 6),
         "time_scale": round(result.time_scale, 6),
-        "weights": dict(settings.weights),
         "direction_error_deg": round(float(np.degrees(result.direction_error)), 1),
     }
