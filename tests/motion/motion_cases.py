@@ -1,0 +1,17 @@
+"""An invented motion for tests of files and folders."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from forgetmimic_jax.motion.clip import Clip
+
+
+def waving(robot, name, frames, yaw_rate=0.0, fps=50.0):
+    """The default pose, walking at 0.3 m/s and turning at yaw_rate rad/s, every joint waving by 0.05 rad."""
+    time = np.arange(frames) / fps
+    joints = np.asarray(robot.arrays.default_joint_pos) + 0.05 * np.sin(
+        2.0 * np.pi * time[:, None] + np.arange(robot.num_joints)
+    )
+    turns = Rotation.from_rotvec(yaw_rate * time[:, None] * [0.0, 0.0, 1.0])
+    path = np.stack([0.3 * time, np.zeros(frames), np.full(frames, robot.default_height)], axis=-1)
+    return Clip(name, fps, robot.joint_names, path, turns.as_quat(scalar_first=True), joints)

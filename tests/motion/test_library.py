@@ -1,0 +1,156 @@
+"""Clip files, manifests and the padded arrays."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from motion_cases import waving
+
+from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.motion import library
+from forgetmimic_jax.motion.clip import Clip, read_clip, write_clip
+from forgetmimic_jax.motion.fit import fit, on_floor, trimmed
+
+
+@pytest.fixture
+def clip(robot) -> Clip:
+    return waving(robot, "sway", 40)
+
+
+@pytest.fixture
+def folder(robot, clip, tmp_path):
+    """A library with the clips `sway`, 40 frames, and `turn`, 25."""
+    path = tmp_path / "library"
+    library.add_clip(path, robot, clip, {"source": "invented"})
+    library.add_clip(path, robot, waving(robot, "turn", 25, yaw_rate=1.0), {"source": "invented"})
+    return path
+
+
+def test_a_clip_s_file_is_the_same_bytes_every_time(clip, tmp_path):
+    write_clip(clip, tmp_path / "a.npz")
+    write_clip(clip, tmp_path / "b.npz")
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.npz", "b.npz"]  # no temporary file is left
+
+
+def test_a_clip_survives_its_file_to_1e_5(clip, tmp_path):
+    write_clip(clip, tmp_path / "sway.npz")
+    found = read_clip(tmp_path / "sway.npz")
+    assert (found.name, found.fps, found.joint_names) == (clip.name, clip.fps, clip.joint_names)
+    for field in ("root_pos", "root_quat", "joint_pos"):
+        np.testing.assert_allclose(getattr(found, field), getattr(clip, field), atol=1.1e-5)
+
+
+def test_shorter_clips_are_padded_with_their_last_frame(robot, folder):
+    loaded = library.load_library(robot, folder)
+    assert loaded.names == ("sway", "turn")
+    assert loaded.length.tolist() == [40, 25]
+    assert loaded.joint_pos.shape == (2, 40, robot.num_joints)
+    assert loaded.body_pos.shape == (2, 40, len(robot.key_bodies), 3)
+    for field in ("joint_pos", "joint_vel", "body_pos", "body_quat", "body_lin_vel", "anchor_lin_acc"):
+        row = np.asarray(getattr(loaded, field))[1]
+        np.testing.assert_array_equal(row[25:], np.broadcast_to(row[24], row[25:].shape))
+
+
+def test_no_velocity_is_taken_across_clips(robot, folder):
+    """Alone or beside another clip, a clip's arrays are the same."""
+    alone = library.load_library(robot, folder, ["turn"])
+    beside = library.load_library(robot, folder)
+    np.testing.assert_array_equal(alone.body_lin_vel[0], beside.body_lin_vel[1, :25])
+
+
+def test_clips_are_loaded_in_the_order_asked_for(robot, folder):
+    assert library.load_library(robot, folder, ["turn", "sway"]).names == ("turn", "sway")
+
+
+def test_a_changed_file_is_noticed(robot, clip, folder):
+    write_clip(dataclasses.replace(clip, root_pos=clip.root_pos + 0.01), folder / "sway.npz")
+    with pytest.raises(InputError, match="sha256"):
+        library.load_library(robot, folder)
+
+
+def test_the_library_s_hash_depends_on_content_alone(robot, clip, folder):
+    before = library.library_hash(folder)
+    manifest = library.read_manifest(folder)
+    manifest["clips"]["sway"]["source"] = "elsewhere"
+    library.write_manifest(folder, manifest)
+    assert library.library_hash(folder) == before
+    library.add_clip(folder, robot, dataclasses.replace(clip, name="more"), {})
+    assert library.library_hash(folder) != before
+
+
+def test_errors_of_a_library(robot, clip, folder, tmp_path):
+    with pytest.raises(InputError, match="did you mean 'sway'"):
+        library.load_library(robot, folder, ["swai"])
+    with pytest.raises(InputError, match="not found"):
+        library.load_library(robot, tmp_path / "none")
+    with pytest.raises(InputError, match=r"already has a clip 'sway'.*--force"):
+        library.add_clip(folder, robot, clip, {})
+    library.add_clip(folder, robot, clip, {}, overwrite=True)
+    for name in ("", "../sway", "a b", ".hidden", "a/b"):
+        with pytest.raises(InputError, match="name"):
+            library.add_clip(folder, robot, dataclasses.replace(clip, name=name), {})
+    with pytest.raises(InputError, match="fps"):
+        library.add_clip(folder, robot, dataclasses.replace(clip, name="x", fps=30.0), {})
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "letter.txt").write_text("dear")
+    with pytest.raises(InputError, match=r"manifest\.json"):
+        library.add_clip(tmp_path / "mine", robot, clip, {})
+    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["letter.txt"]
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"robot": "h2"}, "robot"),
+        ({"schema": 99}, "schema"),
+        ({"clips": {}}, "empty"),
+    ],
+)
+def test_errors_of_a_manifest(robot, folder, change, expected):
+    manifest = json.loads((folder / "manifest.json").read_text())
+    (folder / "manifest.json").write_text(json.dumps({**manifest, **change}))
+    with pytest.raises(InputError, match=expected):
+        library.load_library(robot, folder)
+
+
+def test_a_broken_manifest_is_one_line(robot, folder):
+    (folder / "manifest.json").write_text("{")
+    with pytest.raises(InputError, match="not JSON"):
+        library.load_library(robot, folder)
+
+
+def test_a_clip_with_other_joints_is_refused(robot, clip):
+    other = dataclasses.replace(clip, joint_names=("knee", *clip.joint_names[1:]))
+    with pytest.raises(InputError, match="unknown: knee"):
+        library.build_library(robot, [other])
+
+
+def test_fit_trims_resamples_and_keeps_the_limits(robot, clip):
+    joints = clip.joint_pos.copy()
+    joints[:, 3] = robot.joint_upper[3] + 0.3
+    found = fit(robot, dataclasses.replace(clip, fps=25.0, joint_pos=joints), 50.0, start=0.2, end=0.6)
+    assert (found.fps, found.num_frames) == (50.0, 21)  # 0.2 to 0.6 s, both included
+    np.testing.assert_allclose(found.root_pos[0], clip.root_pos[5])
+    assert (found.joint_pos[:, 3] == robot.joint_upper[3]).all()
+    for start, end in ((-1.0, 1.0), (0.5, 0.5), (0.0, 9.0), (9.0, None)):
+        with pytest.raises(InputError, match="--start"):
+            trimmed(clip, start, end)
+
+
+def test_on_floor_lowers_a_robot_that_hovers(robot, clip):
+    """The default pose stands at its default height; 7 cm higher, it is set back by 7 cm."""
+    still = dataclasses.replace(
+        clip,
+        root_pos=np.tile([0.0, 0.0, robot.default_height], (40, 1)),
+        root_quat=np.tile([1.0, 0.0, 0.0, 0.0], (40, 1)),
+        joint_pos=np.tile(np.asarray(robot.arrays.default_joint_pos, np.float64), (40, 1)),
+    )
+    standing, _ = on_floor(robot, still)
+    hovering, raised = on_floor(
+        robot, dataclasses.replace(standing, root_pos=standing.root_pos + np.array([0.0, 0.0, 0.07]))
+    )
+    assert raised == pytest.approx(-0.07, abs=1e-9)
+    np.testing.assert_allclose(hovering.root_pos, standing.root_pos)
+    assert standing.root_pos[0, 2] == pytest.approx(robot.default_height, abs=0.02)
