@@ -72,7 +72,10 @@ class TerminationConfig:
 
 @dataclass(frozen=True)
 class NoiseConfig:
-    """Reset noise, randomisation and observation noise (uniform half-widths, wbc-mjlab). `enabled` is off in evaluation."""
+    """Reset noise, randomisation and observation noise: uniform half-widths (wbc-mjlab).
+
+    `enabled` stands for all but the reset noise, which evaluation keeps.
+    """
 
     enabled: bool = True
     reset_position: Ranges = (0.05, 0.05, 0.01)  # m

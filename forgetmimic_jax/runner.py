@@ -55,7 +55,7 @@ class Setup:
 def make_setup(config: Config) -> Setup:
     """Load what a config names; bad names and numbers are told before anything is written."""
     validate(config)
-    if not jax.config.jax_compilation_cache_dir:
+    if not jax.config.values["jax_compilation_cache_dir"]:
         jax.config.update("jax_compilation_cache_dir", str(COMPILATION_CACHE))
     robot = load_robot(
         config.robot,

@@ -98,11 +98,11 @@ class NativeEngine:
         return arrays
 
     def _step_host(self, arguments) -> tuple[np.ndarray, ...]:
-        *state, friction, torso_com, target, wrench = (np.asarray(x) for x in arguments)
+        *loaded, target, wrench = (np.asarray(x) for x in arguments)
         # What overflows float32 has diverged, and shows as infinity: no warning on the user's screen.
         with self._lock, np.errstate(over="ignore"):
             batch = self._batch
-            self._load(self._everyone, *state, friction, torso_com)
+            self._load(self._everyone, *loaded)
             batch.ctrl[:] = target
             batch.xfrc_applied[:, self._anchor] = wrench
             batch.step(nstep=self._substeps, stage=_VELOCITY_STAGE)
@@ -111,10 +111,10 @@ class NativeEngine:
             return (*new, *self._bodies(self._everyone), force)
 
     def _forward_host(self, arguments) -> tuple[np.ndarray, ...]:
-        *state, friction, torso_com, mask = (np.asarray(x) for x in arguments)
+        *loaded, mask = (np.asarray(x) for x in arguments)
         with self._lock:
             rows = np.flatnonzero(mask)
             if rows.size:
-                self._load(rows, *state, friction, torso_com)
+                self._load(rows, *loaded)
                 self._batch.forward(ids=rows.astype(np.int32), stage=_VELOCITY_STAGE)
             return self._bodies(rows)
