@@ -54,7 +54,7 @@ class RewardConfig:
     joint_limit: float = -1.0
     torque_limit: float = -0.1
     torque_soft_ratio: float = 0.9
-    # The paper's table lists these with weight 0: computed by no one until a weight turns them on.
+    # The paper's table lists these with weight 0: no one computes them, and `validate` accepts no other weight.
     foot_slip: float = 0.0
     angular_momentum: float = 0.0
 
@@ -226,6 +226,9 @@ _SHARES = {
 }
 
 
+_NOT_COMPUTED = {"reward.foot_slip", "reward.angular_momentum"}
+
+
 def validate(config: Config) -> None:
     """Tell numbers that no run can work with before anything is built.
 
@@ -244,6 +247,8 @@ def validate(config: Config) -> None:
             good, accepted = 0.0 < value < math.inf, "above 0"
         elif name in _SHARES:
             good, accepted = 0.0 <= value <= 1.0, "0 to 1"
+        elif name in _NOT_COMPUTED:
+            good, accepted = value == 0.0, "0 (this term is not computed)"
         elif name.startswith("reward."):
             good, accepted = math.isfinite(value), "any finite number"
         else:

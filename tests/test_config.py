@@ -166,6 +166,10 @@ def test_the_file_is_plain_yaml(path):
             "reward.survival: found inf; accepted: any finite number",
         ),
         (
+            dataclasses.replace(Config(), reward=dataclasses.replace(Config().reward, foot_slip=-0.1)),
+            "reward.foot_slip: found -0.1; accepted: 0 (this term is not computed)",
+        ),
+        (
             dataclasses.replace(Config(), noise=dataclasses.replace(Config().noise, push_interval=(1.0,))),
             "noise.push_interval: found 1 numbers; accepted: 2",
         ),
