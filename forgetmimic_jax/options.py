@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -20,9 +20,10 @@ C = TypeVar("C", Config, PhysicsConfig)
 Settings = Annotated[list[list[str]], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="SECTION.NAME=VALUE")]
 
 
-def parse(options: type[T], command: str) -> T:
-    """The command line as `options`; flags that are none end `python -m forgetmimic_jax.COMMAND` with exit code 2."""
-    return tyro.cli(options, prog=f"python -m forgetmimic_jax.{command}", config=(tyro.conf.FlagCreatePairsOff,))
+def parse(options: type[T], command: str, arguments: Sequence[str] | None = None) -> T:
+    """The command line, or `arguments`, as `options`; flags that are none end the command with exit code 2."""
+    name = f"python -m forgetmimic_jax.{command}"
+    return tyro.cli(options, prog=name, args=arguments, config=(tyro.conf.FlagCreatePairsOff,))
 
 
 def check_same(options: Any, saved: dict[str, Any]) -> None:

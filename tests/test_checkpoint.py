@@ -10,6 +10,7 @@ import jax
 import numpy as np
 import pytest
 import yaml
+from trees import assert_same
 
 from forgetmimic_jax import checkpoint, runner
 from forgetmimic_jax.errors import InputError
@@ -57,18 +58,6 @@ def saved(tmp_path_factory, state, setup) -> Path:
 def copy(tmp_path, saved) -> Path:
     """A checkpoint that a test may damage."""
     return Path(shutil.copytree(saved, tmp_path / "copy"))
-
-
-def leaves(tree) -> dict[str, np.ndarray]:
-    return {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(tree)}
-
-
-def assert_same(found, expected):
-    found, expected = leaves(found), leaves(expected)
-    assert found.keys() == expected.keys()
-    for name, leaf in expected.items():
-        assert found[name].dtype == leaf.dtype, name
-        np.testing.assert_array_equal(found[name], leaf, err_msg=name)
 
 
 def test_every_leaf_comes_back_bit_for_bit(saved, state, template):

@@ -1,0 +1,64 @@
+"""The whole path in miniature: a base of four iterations and a policy that was told to forget `turn` for two more."""
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from miniature import TINY, Run, finished
+
+from forgetmimic_jax import runner, train, unlearn
+from forgetmimic_jax.errors import run_command
+
+
+@pytest.fixture(scope="session", autouse=True)
+def compiled_once() -> Iterator[None]:
+    """Runs of the same settings share one compiled iteration; it depends on none of the settings left out here."""
+    make, compiled = runner.make_iteration, {}
+
+    def shared(env):
+        key = dataclasses.replace(env.config, iterations=1, checkpoint_every=1, base=None, seed=0)
+        return compiled.setdefault(key, make(env))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(runner, "make_iteration", shared)
+        yield
+
+
+@pytest.fixture(scope="session")
+def base_run(tmp_path_factory, library_folder) -> Run:
+    output = tmp_path_factory.mktemp("runs") / "base"
+    return finished(train.main, train.Options(library=library_folder, output=output, iterations=4, set=[TINY]))
+
+
+@pytest.fixture(scope="session")
+def unlearned_run(base_run) -> Run:
+    output = base_run.folder.parent / "unlearned"
+    options = unlearn.Options(
+        base=base_run.checkpoint(4), targets=" turn, turn ,", iterations=2, episodes=3, output=output
+    )
+    return finished(unlearn.main, options)
+
+
+@pytest.fixture
+def refused(tmp_path, monkeypatch, capfd) -> Callable[[Callable[[Any], None], Any], str]:
+    """`refused(main, options)`: the one line that a command ends with, having left every file as it was."""
+    monkeypatch.chdir(tmp_path)
+
+    def files() -> dict[Path, bytes | None]:
+        return {path: path.read_bytes() if path.is_file() else None for path in tmp_path.rglob("*")}
+
+    def refused(main: Callable[[Any], None], options: Any) -> str:
+        before = files()
+        with pytest.raises(SystemExit) as exit_:
+            run_command(lambda: main(options))
+        printed, error = capfd.readouterr()
+        assert exit_.value.code == 2
+        assert printed == ""
+        assert error.startswith("error: ")
+        assert error.count("\n") == 1
+        assert files() == before
+        return error.removeprefix("error: ").rstrip()
+
+    return refused

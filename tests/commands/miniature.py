@@ -1,0 +1,46 @@
+"""What tests of the commands share."""
+
+import contextlib
+import dataclasses
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from forgetmimic_jax import checkpoint, runner
+from forgetmimic_jax.state import TrainState
+
+# The assistive wrench is on, so that unlearning has something to turn off.
+TINY = [
+    *("physics.engine=native", "evaluate_every=0", "checkpoint_every=2", "sampling.bin_seconds=0.4"),
+    *("wrench.max_gain=0.5", "ppo.num_envs=8", "ppo.num_steps=4", "ppo.epochs=2", "ppo.minibatches=2"),
+    *("ppo.actor_layers=[16]", "ppo.critic_layers=[16]"),
+]
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """A run that came to its end: its folder and what it printed."""
+
+    folder: Path
+    printed: str
+
+    def checkpoint(self, iteration: int) -> Path:
+        return self.folder / "checkpoints" / f"{iteration:08d}"
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        return [json.loads(line) for line in (self.folder / "metrics.jsonl").read_text().splitlines()]
+
+
+def finished(main: Callable[[Any], None], options: Any) -> Run:
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        main(options)
+    return Run(options.output, printed.getvalue())
+
+
+def load_state(path: Path) -> TrainState:
+    """The whole state of a checkpoint."""
+    return checkpoint.load_state(path, runner.template(runner.make_setup(checkpoint.read_info(path).config)))
