@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ import tyro
 
 from forgetmimic_jax.console import closing
 from forgetmimic_jax.errors import InputError, run_command
-from forgetmimic_jax.options import parse
+from forgetmimic_jax.options import comma_separated, parse
 
 if TYPE_CHECKING:
     from forgetmimic_jax.motion.clip import Clip
@@ -59,6 +60,8 @@ class Retarget:
     """Folder with DeepMimic's humanoid3d_*.txt."""
     output: Path
     """Folder for the library; one without other files, or a library to be replaced with --force."""
+    clips: str | None = None
+    """Clips to make, comma-separated; all of the shipped by default."""
     force: bool = False
     """Replace the library in the output folder."""
 
@@ -115,6 +118,8 @@ class Options:
 
 def main(options: Options) -> None:
     """Run one of the commands."""
+    # Before NumPy starts: its threads only stand in each other's way on matrices as small as a robot's.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from forgetmimic_jax.robot import load_robot
 
     robot = load_robot(options.robot)
@@ -177,7 +182,8 @@ def retarget(robot: Robot, options: Retarget) -> None:
             raise InputError(f"{options.output}: has files but no {MANIFEST}; give an empty or a new folder")
         if not options.force:
             raise InputError(f"{options.output}: already holds a library; give another --output, or --force")
-    recipe.retarget_library(robot, options.source, options.output, report=lambda name: print(name, flush=True))
+    names = recipe.CLIPS if options.clips is None else comma_separated(options.clips)
+    recipe.retarget_library(robot, options.source, options.output, names, report=lambda name: print(name, flush=True))
     closing(
         {"library": options.output},
         f"python -m forgetmimic_jax.motions --robot {robot.name} check --library {options.output}",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.errors import InputError, nearest
 from forgetmimic_jax.motion import library
 from forgetmimic_jax.motion.clip import Clip, write_clip
 from forgetmimic_jax.motion.contact import floor_points, human_contact
@@ -124,20 +124,34 @@ def _at_origin(clip: Clip) -> Clip:
 
 
 def retarget_library(
-    robot: Robot, source: Path, output: Path, report: Callable[[str], None] = lambda line: None
+    robot: Robot,
+    source: Path,
+    output: Path,
+    names: Iterable[str] = tuple(CLIPS),
+    report: Callable[[str], None] = lambda name: None,
 ) -> Path:
     """Make the shipped library from a folder of DeepMimic clips; nothing is written before every clip is made.
 
+    Args:
+        robot: to retarget to.
+        source: folder with humanoid3d_*.txt.
+        output: folder of the library.
+        names: clips to make.
+        report: called with each clip's name when it is made.
+
     Raises:
-        InputError: a clip is missing from the folder or is not DeepMimic's.
+        InputError: no clip of that name, or one that is missing from the folder or is not DeepMimic's.
     """
-    for name in CLIPS:
+    names = tuple(names)
+    for name in names:
+        if name not in CLIPS:
+            raise InputError(f"clips: no clip '{name}'; {nearest(name, CLIPS)}")
         if not source_file(source, name).is_file():
             raise InputError(f"{source_file(source, name)}: not found; retarget needs DeepMimic's humanoid3d_*.txt")
         read_deepmimic(source_file(source, name))
     results = {}
-    for name, settings in CLIPS.items():
-        results[name] = retarget_clip(robot, source_file(source, name), name, settings)
+    for name in names:
+        results[name] = retarget_clip(robot, source_file(source, name), name, CLIPS[name])
         report(name)
     output.mkdir(parents=True, exist_ok=True)
     entries = {}
@@ -150,7 +164,7 @@ def retarget_library(
             "schema": library.SCHEMA,
             "robot": robot.name,
             "fps": FPS,
-            "default_targets": list(DEFAULT_TARGETS),
+            "default_targets": [name for name in DEFAULT_TARGETS if name in names],
             "refinement": dataclasses.asdict(Weights()),
             "clips": entries,
         },

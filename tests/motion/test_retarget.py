@@ -1,13 +1,14 @@
 """DeepMimic's clips: read to known numbers, retargeted to the same bytes as the shipped ones."""
 
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
 from forgetmimic_jax.errors import InputError
 from forgetmimic_jax.motion import library, recipe
-from forgetmimic_jax.motion.clip import write_clip
 from forgetmimic_jax.motion.deepmimic import forward_kinematics, read_deepmimic
 
 
@@ -75,12 +76,21 @@ def test_a_missing_source_is_told_before_anything_is_written(robot, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("name", ["walk", "kick"])
-def test_a_shipped_clip_is_made_again_bit_for_bit(robot, deepmimic, tmp_path, name):
-    """A cyclic and a single one. What made the file is in the repository; its hash is in the manifest."""
-    source = recipe.source_file(deepmimic, name)
-    result = recipe.retarget_clip(robot, source, name, recipe.CLIPS[name])
-    write_clip(result.clip, tmp_path / f"{name}.npz")
-    entry = library.read_manifest(library.DATA_DIR / robot.name)["clips"][name]
-    assert library.file_hash(source) == entry["source_sha256"]
-    assert library.file_hash(tmp_path / f"{name}.npz") == entry["sha256"]
+def test_an_unknown_clip_is_told(robot, tmp_path):
+    with pytest.raises(InputError, match="did you mean 'backflip'"):
+        recipe.retarget_library(robot, tmp_path, tmp_path / "out", ["backfip"])
+
+
+def test_shipped_clips_are_made_again_bit_for_bit(deepmimic, tmp_path):
+    """A cyclic and a single one, by the command: what made the files is in the repository."""
+    output = tmp_path / "again"
+    command = [sys.executable, "-m", "forgetmimic_jax.motions", "--robot", "g1", "retarget", "--clips", "run,kick"]
+    done = subprocess.run(
+        [*command, "--source", deepmimic, "--output", output], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    shipped = library.DATA_DIR / "g1"
+    again, entries = library.read_manifest(output)["clips"], library.read_manifest(shipped)["clips"]
+    for name in ("run", "kick"):
+        assert (output / f"{name}.npz").read_bytes() == (shipped / f"{name}.npz").read_bytes()
+        assert again[name] == entries[name]
