@@ -236,7 +236,10 @@ def list_clips(robot: Robot, options: List) -> None:
     width = max(len(clip.name) for clip in clips)
     for clip in clips:
         print(f"{clip.name:<{width}}  {clip.seconds:7.2f} s  {entries[clip.name].get('source', '')}")
-    closing({"library": folder}, f"python -m forgetmimic_jax.motions --robot {robot.name} show {clips[0].name}")
+    closing(
+        {"library": folder},
+        f"python -m forgetmimic_jax.motions --robot {robot.name} show {clips[0].name} --library {folder}",
+    )
 
 
 def _open(
@@ -246,6 +249,8 @@ def _open(
     from forgetmimic_jax.motion import library
 
     folder = folder or library.DATA_DIR / robot.name
+    if folder.is_absolute() and folder.is_relative_to(Path.cwd()):
+        folder = folder.relative_to(Path.cwd())
     clips = library.read_library(robot, folder, names)
     return folder, clips, library.read_manifest(folder)["clips"]
 

@@ -117,8 +117,9 @@ def read_npz(
             f"{path}: missing {' and '.join(names)}, so the order is unknown; "
             f"give --assume-robot-order if it is {robot.name}'s own (root first)"
         )
-    joint_pos = content["joint_pos"].astype(np.float64)
-    body_pos, body_quat = content["body_pos_w"].astype(np.float64), content["body_quat_w"].astype(np.float64)
+    joint_pos = _numbers(content["joint_pos"], "joint_pos", path)
+    body_pos = _numbers(content["body_pos_w"], "body_pos_w", path)
+    body_quat = _numbers(content["body_quat_w"], "body_quat_w", path)
     for field, value, tail in (("body_pos_w", body_pos, 3), ("body_quat_w", body_quat, 4)):
         if value.ndim != 3 or value.shape[-1] != tail or len(value) != len(joint_pos):
             raise InputError(
@@ -132,7 +133,7 @@ def read_npz(
     if root_name not in bodies:
         raise InputError(f"{path}: body_names: no '{root_name}'; found {', '.join(bodies[:4])} …")
     root = bodies.index(root_name)
-    rate = float(np.ravel(content["fps"])[0]) if fps is None else float(fps)
+    rate = _rate(content["fps"] if fps is None else fps, path)
     quat = _wxyz(body_quat[:, root], _order(quaternion_order, "wxyz"), path, "body_quat_w")
     clip = _ordered(robot, Clip(path.stem, rate, joints, body_pos[:, root], quat, joint_pos), path)
     if names and body_pos.shape[1] == robot.model.nbody - 1:
@@ -161,7 +162,7 @@ def read_gmr(robot: Robot, path: Path, fps: float | None = None, quaternion_orde
     joints = arrays["dof_pos"].shape[-1] if arrays["dof_pos"].ndim else 0
     if joints != robot.num_joints:
         raise InputError(f"{path}: dof_pos: found {joints} joints; {robot.num_joints} of {robot.name} are needed")
-    rate = float(_numbers(content["fps"] if fps is None else fps, "fps", path).reshape(-1)[0])
+    rate = _rate(content["fps"] if fps is None else fps, path)
     quat = _wxyz(arrays["root_rot"], _order(quaternion_order, "xyzw"), path, "root_rot")
     return Clip(path.stem, rate, robot.joint_names, arrays["root_pos"], quat, arrays["dof_pos"])
 
@@ -199,6 +200,14 @@ def _numbers(value: Any, field: str, path: Path) -> np.ndarray:
         raise InputError(f"{path}: {field}: found a {type(value).__name__}; numbers are needed") from None
 
 
+def _rate(value: Any, path: Path) -> float:
+    """Frames per s; some files hold an array of one."""
+    rates = _numbers(value, "fps", path).reshape(-1)
+    if len(rates) != 1:
+        raise InputError(f"{path}: fps: found {len(rates)} numbers; one is needed")
+    return float(rates[0])
+
+
 def _order(given: str, own: str) -> str:
     return own if given == "auto" else given
 
@@ -214,7 +223,7 @@ def _ordered(robot: Robot, clip: Clip, path: Path) -> Clip:
     """The clip with its joints in the robot's order."""
     missing = [joint for joint in robot.joint_names if joint not in clip.joint_names]
     unknown = [joint for joint in clip.joint_names if joint not in robot.joint_names]
-    if missing or unknown:
+    if missing or unknown or len(clip.joint_names) != robot.num_joints:
         raise InputError(
             f"{path}: joint_names: not {robot.name}'s {robot.num_joints} joints "
             f"(missing: {', '.join(missing[:3]) or 'none'}; unknown: {', '.join(unknown[:3]) or 'none'})"

@@ -174,6 +174,12 @@ def test_an_npz_that_is_no_motion(robot, tmp_path):
     assert "joint_pos" in message(robot, with_changes(joint_pos=fields["joint_pos"][:, :-1]))
     assert "body_quat_w" in message(robot, with_changes(body_quat_w=fields["body_quat_w"][:, 0]))
     assert "body_pos_w" in message(robot, with_changes(body_pos_w=fields["body_pos_w"][:3]))
+    assert "fps" in message(robot, with_changes(fps=np.array([])))
+    assert "fps" in message(robot, with_changes(fps=np.array("fast")))
+    assert "joint_pos" in message(robot, with_changes(joint_pos=np.array("here")))
+    assert "NPZ" in message(robot, with_changes(joint_pos=np.array([{}], dtype=object)))
+    doubled = {"joint_names": np.array([*robot.joint_names, robot.joint_names[0]])}
+    assert "joint_names" in message(robot, with_changes(**doubled, joint_pos=np.zeros((5, 30))))
     path.write_bytes(b"not a zip")
     assert "NPZ" in message(robot, path)
 
