@@ -1,0 +1,260 @@
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from miniature import load_state
+from trees import assert_same
+
+from forgetmimic_jax import checkpoint, runner, unlearn
+from forgetmimic_jax.config import load_config
+from forgetmimic_jax.errors import Interrupted, run_command
+from forgetmimic_jax.evaluation import evaluate as evaluation
+
+
+@pytest.fixture
+def options(base_run):
+    """Options that forget `turn` in the working folder."""
+
+    def options(**given) -> unlearn.Options:
+        return unlearn.Options(**{"base": base_run.checkpoint(4), "targets": "turn", "output": Path("run")} | given)
+
+    return options
+
+
+def test_it_starts_from_the_base_s_policy_with_adam_reset(base_run, unlearned_run):
+    start, base = load_state(unlearned_run.checkpoint(0)), load_state(base_run.checkpoint(4))
+    assert_same(start.policy, base.policy)  # networks and normalisers
+    assert all((leaf == 0).all() for leaf in map(np.asarray, jax.tree.leaves(start.optimizer)))
+    assert any((leaf != 0).any() for leaf in map(np.asarray, jax.tree.leaves(base.optimizer)))
+
+
+def test_the_sampler_is_uniform_and_the_wrench_off(base_run, unlearned_run):
+    # The base had neither: failed bins were drawn more often, and every episode was assisted.
+    base, forgetting = base_run.rows[-1], unlearned_run.rows[-1]
+    assert [clip["probability"] for clip in forgetting["clips"].values()] == pytest.approx([1 / 3] * 3, abs=1e-5)
+    assert [clip["probability"] for clip in base["clips"].values()] != pytest.approx([1 / 3] * 3, abs=0.01)
+    assert (base["wrench_gain"], forgetting["wrench_gain"]) == (pytest.approx(0.5, abs=0.05), 0.0)
+    assert (np.asarray(load_state(unlearned_run.checkpoint(0)).env.wrench_gain) == 0.0).all()
+
+
+def test_its_settings_are_the_base_s_but_for_what_unlearning_changes(base_run, unlearned_run):
+    base = load_config(base_run.folder / "config.yaml")
+    found = load_config(unlearned_run.folder / "config.yaml")
+    assert (found.unlearn.targets, found.unlearn.penalty) == (("turn",), 16.0)  # it was asked for " turn, turn ,"
+    assert found == dataclasses.replace(
+        base,
+        base=str(base_run.checkpoint(4)),
+        iterations=2,
+        evaluate_every=found.evaluate_every,
+        unlearn=found.unlearn,
+        sampling=dataclasses.replace(base.sampling, rule="uniform_clips"),
+        wrench=dataclasses.replace(base.wrench, max_gain=0.0),
+    )
+
+
+def test_the_metrics_tell_targets_and_kept_clips_apart(unlearned_run):
+    (row,) = unlearned_run.rows
+    for group in ("target", "kept"):
+        for name in ("step_share", "R_track", "R_reg", "R_anti", "tracking_reward", "lambda_crit"):
+            assert np.isfinite(row[f"{group}/{name}"]), name
+        assert 0.0 < row[f"{group}/tracking_reward"] < 1.0
+        assert row[f"{group}/R_track"] > 0.0 > row[f"{group}/R_reg"]
+    assert row["target/step_share"] + row["kept/step_share"] == pytest.approx(1.0)
+    assert row["target/R_anti"] == pytest.approx(-16.0 * row["target/tracking_reward"], rel=1e-5)
+    assert row["kept/R_anti"] == 0.0
+
+
+def test_the_evaluation_has_the_documented_form(base_run, unlearned_run):
+    document = json.loads((unlearned_run.folder / "evaluation.json").read_text())
+    policies = document.pop("policies")
+    assert document == {
+        "schema": 1,
+        "robot": "g1",
+        "checkpoint": str(unlearned_run.checkpoint(2)),
+        "config_hash": document["config_hash"],
+        "library_hash": checkpoint.read_info(base_run.checkpoint(4)).library_hash,
+        "seed": 0,
+        "episodes": 3,
+        "targets": ["turn"],
+        "budget": {
+            "base": {"iterations": 4, "environment_steps": 128},
+            "unlearned": {"iterations": 2, "environment_steps": 64},
+        },
+    }
+    assert policies.keys() == {"base", "unlearned", "zero_action"}
+    for policy in policies.values():
+        assert {name: clip["target"] for name, clip in policy["clips"].items()} == {
+            "sway": False, "turn": True, "nod": False,
+        }  # fmt: skip
+        assert (policy["target"]["success_rate"]["n"], policy["kept"]["success_rate"]["n"]) == (3, 6)
+        assert policy["degradation_ratio"]["mean"] > 0.0
+        for numbers in (policy["target"], policy["kept"], *policy["clips"].values()):
+            for name in ("tracking_reward", "survival_weighted_tracking", "success_rate", "episode_length", "mpkpe"):
+                number = numbers[name]
+                assert number.keys() == {"mean", "low", "high", "std", "n"}, name
+                assert number["low"] - 1e-9 <= number["mean"] <= number["high"] + 1e-9
+    assert "retention" in policies["unlearned"]["kept"]
+
+
+def test_it_ends_with_the_table_the_files_and_what_to_do_next(unlearned_run):
+    assert {path.name for path in unlearned_run.folder.iterdir()} == {
+        *("checkpoints", "config.yaml", "events", "metrics.jsonl"),
+        *("evaluation.json", "evaluation.md", "evaluation.png"),
+    }
+    assert (unlearned_run.folder / "evaluation.png").read_bytes().startswith(b"\x89PNG")
+    assert (unlearned_run.folder / "evaluation.md").read_text().startswith("# Evaluation: g1, targets: turn\n")
+    printed = unlearned_run.printed.splitlines()
+    assert printed[0] == "forget turn: 0/2"
+    assert "Clip by clip" in [line.strip() for line in printed]
+    path = unlearned_run.checkpoint(2)
+    assert printed[-1] == f"Next: make evaluate ROBOT=g1 CHECKPOINT={path} EPISODES=100"
+
+
+@pytest.fixture
+def evaluated(monkeypatch) -> dict:
+    """What would have been evaluated."""
+    seen = {}
+
+    def evaluate(config, robot, library, library_hash, policies, **conditions):
+        seen.update(policies=policies, **conditions)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(evaluation, "evaluate", evaluate)
+    return seen
+
+
+def test_resumed_it_compares_with_the_base_it_started_from(base_run, unlearned_run, evaluated):
+    with pytest.raises(Interrupted):
+        unlearn.main(unlearn.Options(output=unlearned_run.folder, resume=True, episodes=5))
+    assert_same(evaluated["policies"]["base"], load_state(base_run.checkpoint(4)).policy)
+    assert_same(evaluated["policies"]["unlearned"], load_state(unlearned_run.checkpoint(2)).policy)
+    assert (evaluated["targets"], evaluated["episodes"]) == (("turn",), 5)
+
+
+def test_a_stop_during_the_evaluation_says_how_to_go_on(unlearned_run, evaluated, capfd):
+    with pytest.raises(SystemExit) as exit_:
+        run_command(lambda: unlearn.main(unlearn.Options(output=unlearned_run.folder, resume=True)))
+    assert exit_.value.code == 130
+    assert capfd.readouterr().err == (
+        f"stopped; saved {unlearned_run.checkpoint(2)}; "
+        f"go on with: make unlearn ROBOT=g1 RESUME=1 OUTPUT={unlearned_run.folder}\n"
+    )
+
+
+def test_targets_are_the_library_s_own_unless_named(options):
+    assert unlearn._config_of_new_run(options(targets=None)).unlearn.targets == ("turn",)
+    assert unlearn._config_of_new_run(options(targets="nod,sway")).unlearn.targets == ("nod", "sway")
+
+
+def test_a_preset_brings_its_settings_but_keeps_the_base_s_network(options, base_run):
+    config = unlearn._config_of_new_run(options(preset="paper", seed=3))
+    base = load_config(base_run.folder / "config.yaml")
+    assert (config.preset, config.iterations, config.seed, config.library) == ("paper", 1000, 3, base.library)
+    assert (config.ppo.num_envs, config.ppo.actor_layers, config.ppo.critic_layers) == (4096, (16,), (16,))
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"targets": "trun"}, "targets: no clip 'trun' in the library; did you mean 'turn'?"),
+        ({"targets": "turn,punch"}, "targets: no clip 'punch' in the library; known: sway, turn, nod"),
+        ({"targets": "sway,turn,nod"}, "targets: all 3 clips of the library; leave at least one to keep"),
+        ({"targets": " , "}, "--targets: no clip named; name at least one to forget, such as --targets punch,kick"),
+        (
+            {"set": [["unlearn.targets=[]"]]},
+            "--targets: no clip named; name at least one to forget, such as --targets punch,kick",
+        ),
+        ({"penalty": 0.0}, "unlearn.penalty: found 0; accepted: above 0"),
+        ({"penalty": -16.0}, "unlearn.penalty: found -16; accepted: above 0"),
+        ({"penalty": float("nan")}, "unlearn.penalty: found nan; accepted: above 0"),
+        ({"penalty": float("inf")}, "unlearn.penalty: found inf; accepted: above 0"),
+        ({"episodes": 0}, "--episodes: found 0; accepted: 1 or more"),
+        ({"iterations": 0}, "iterations: found 0; accepted: 1 or more"),
+        ({"iterations": -1}, "iterations: found -1; accepted: 1 or more"),
+        ({"robot": "gg1"}, "robot 'gg1': no robots/gg1/gg1.yaml; did you mean 'g1'?"),
+        ({"robot": "gg1", "base": None}, "robot 'gg1': no robots/gg1/gg1.yaml; did you mean 'g1'?"),
+        ({"base": Path("nowhere")}, "nowhere: no such checkpoint folder"),
+        ({"library": Path("nowhere")}, "nowhere/manifest.json: not found; a library is a folder with manifest.json"),
+        ({"resume": True}, "run: --resume finds no checkpoint there; leave it out to start"),
+        (
+            {"resume": True, "output": None},
+            "runs/unlearn-g1-001: --resume finds no checkpoint there; leave it out to start",
+        ),
+    ],
+)
+def test_what_cannot_be_is_told_in_one_line(refused, options, given, told):
+    assert refused(unlearn.main, options(**given)) == told
+
+
+def test_no_shipped_base_is_told(refused, options, tmp_path, monkeypatch):
+    monkeypatch.setattr(runner, "DATA_DIR", tmp_path)
+    told = f"{tmp_path}/g1/base: no policy is shipped for 'g1'; train one and name its checkpoint"
+    assert refused(unlearn.main, options(base=None)) == told
+
+
+@pytest.fixture
+def damaged(base_run, tmp_path) -> Path:
+    """A copy of the base that a test may damage."""
+    return Path(shutil.copytree(base_run.checkpoint(4), tmp_path / "base"))
+
+
+def test_a_base_of_another_robot_is_told(refused, options, damaged):
+    note = json.loads((damaged / "meta.json").read_text())
+    (damaged / "meta.json").write_text(json.dumps(note | {"robot": "h2", "joints": note["joints"][:3]}))
+    joints = len(note["joints"])
+    told = f"{damaged}: robot: the checkpoint's is 'h2' (3 joints), asked for 'g1' ({joints} joints)"
+    assert refused(unlearn.main, options(base=damaged)) == told
+
+
+def test_a_base_of_another_network_is_told(refused, options, damaged):
+    told = refused(unlearn.main, options(base=damaged, set=[["ppo.critic_layers=[8]"]]))
+    assert told == f"{damaged}: ppo.critic_layers: the checkpoint's is [16], asked for [8]"
+
+
+def test_a_base_of_another_library_is_told(refused, options, damaged, tmp_path, library_folder):
+    library = Path(shutil.copytree(library_folder, tmp_path / "library"))
+    manifest = json.loads((library / "manifest.json").read_text())
+    del manifest["clips"]["nod"]
+    (library / "manifest.json").write_text(json.dumps(manifest))
+    told = refused(unlearn.main, options(base=damaged, library=library))
+    assert told.startswith(f"{damaged}: library: the checkpoint's hash is ")
+    assert told.endswith("(missing here: nod)")
+
+
+def test_a_damaged_base_is_told(refused, options, damaged):
+    for file in (damaged / "policy" / "d").iterdir():
+        file.write_bytes(file.read_bytes()[:100])
+        assert refused(unlearn.main, options(base=damaged)) == (
+            f"{file}: damaged: not what was saved; the checkpoint cannot be used"
+        )
+    (damaged / "meta.json").write_text("{")
+    assert refused(unlearn.main, options(base=damaged)).startswith(f"{damaged}/meta.json: damaged: ")
+
+
+def test_a_damaged_checkpoint_to_resume_is_told(refused, unlearned_run, tmp_path):
+    run = Path(shutil.copytree(unlearned_run.folder, tmp_path / "run"))
+    shutil.rmtree(run / "checkpoints" / "00000002" / "run" / "d")
+    told = refused(unlearn.main, unlearn.Options(output=run, resume=True))
+    assert told.startswith(f"{run}/checkpoints/00000002/run/d/")
+    assert told.endswith(": missing; the checkpoint cannot be used")
+
+
+def test_a_base_that_is_gone_is_told_before_the_run_goes_on(refused, unlearned_run, tmp_path):
+    run = Path(shutil.copytree(unlearned_run.folder, tmp_path / "run"))
+    config = (run / "config.yaml").read_text().splitlines()
+    (run / "config.yaml").write_text("\n".join("base: gone" if "base: " in line else line for line in config))
+    told = refused(unlearn.main, unlearn.Options(output=run, resume=True, iterations=3))
+    assert told == "gone: no such checkpoint folder"
+
+
+def test_flags_that_contradict_the_run_to_resume_are_told(refused, unlearned_run):
+    def resume(**flags) -> str:
+        return refused(unlearn.main, unlearn.Options(output=unlearned_run.folder, resume=True, **flags))
+
+    assert resume(penalty=8.0) == "--penalty: found 8.0, but the run to resume has 16.0; leave the flag out"
+    assert resume(targets="nod, sway").startswith("--targets: found nod,sway, but the run to resume has turn")
+    assert resume(base=Path("other")).startswith("--base: found other, but the run to resume has ")
