@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from forgetmimic_jax.errors import run_command
+from forgetmimic_jax.errors import InputError, run_command
 from forgetmimic_jax.options import at_least, on_engine, parse, replace_given
 
 
@@ -53,6 +53,8 @@ def main(options: Options) -> None:
     at_least(1, "--repeats", options.repeats)
     if options.output:
         runner.check_writable(options.output.parent)
+        if options.output.is_dir():
+            raise InputError(f"{options.output}: a folder; --output is a file")
     config = replace_given(preset(options.preset), robot=options.robot, library=options.library)
     config = on_engine(config, options.physics)
     setup = runner.make_setup(config)

@@ -1,0 +1,92 @@
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from miniature import finished
+
+from forgetmimic_jax import evaluate
+from forgetmimic_jax.options import on_engine, parse
+from forgetmimic_jax.physics.engine import resolve_engine
+
+
+@pytest.fixture
+def options(base_run):
+    """Options that evaluate the base in the working folder."""
+
+    def options(**given) -> evaluate.Options:
+        return evaluate.Options(**{"checkpoint": base_run.checkpoint(4), "output": Path("out"), "episodes": 3} | given)
+
+    return options
+
+
+@pytest.fixture(scope="session")
+def evaluated_again(unlearned_run, tmp_path_factory):
+    """The unlearned policy, evaluated by the command of that name under the conditions of the unlearning run's own."""
+    output = tmp_path_factory.mktemp("runs") / "evaluated"
+    options = evaluate.Options(checkpoint=unlearned_run.checkpoint(2), episodes=3, output=output)
+    return finished(evaluate.main, options)
+
+
+def test_the_same_seed_gives_the_same_evaluation_twice(unlearned_run, evaluated_again):
+    # The base it is compared with is the one it started from, which its checkpoint names.
+    first, again = (
+        json.loads((run.folder / "evaluation.json").read_text()) for run in (unlearned_run, evaluated_again)
+    )
+    assert again == first
+
+
+def test_it_ends_with_the_files_and_what_to_do_next(evaluated_again):
+    assert sorted(path.name for path in evaluated_again.folder.iterdir()) == [
+        f"evaluation.{kind}" for kind in ("json", "md", "png")
+    ]
+    printed = evaluated_again.printed.splitlines()
+    assert printed[0] == "evaluate: 0/3"
+    assert f"evaluation  {evaluated_again.folder}/evaluation.json" in printed
+    assert printed[-1] == "Next: make unlearn ROBOT=g1"
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"robot": "gg1", "checkpoint": None}, "robot 'gg1': no robots/gg1/gg1.yaml; did you mean 'g1'?"),
+        ({"robot": "gg1"}, "robot 'gg1': no robots/gg1/gg1.yaml; did you mean 'g1'?"),
+        ({"checkpoint": Path("nowhere")}, "nowhere: no such checkpoint folder"),
+        ({"episodes": 0}, "--episodes: found 0; accepted: 1 or more"),
+        ({"seed": -1}, "--seed: found -1; accepted: 0 or more"),
+        ({"targets": "trun"}, "targets: no clip 'trun' in the library; did you mean 'turn'?"),
+        ({"targets": "nod,turn,sway"}, "targets: all 3 clips of the library; leave at least one to keep"),
+        ({"library": Path("nowhere")}, "nowhere/manifest.json: not found; a library is a folder with manifest.json"),
+    ],
+)
+def test_what_cannot_be_is_told_in_one_line(refused, options, given, told):
+    assert refused(evaluate.main, options(**given)) == told
+
+
+def test_a_run_in_place_of_a_checkpoint_is_told(refused, options, base_run):
+    told = refused(evaluate.main, options(checkpoint=base_run.folder))
+    assert told.endswith(
+        f"not a checkpoint: no meta.json; it is a run, whose newest checkpoint is {base_run.checkpoint(4)}"
+    )
+
+
+def test_an_output_that_cannot_be_is_told_before_the_rollouts(refused, options, tmp_path):
+    (tmp_path / "file").write_text("mine")
+    for output in (tmp_path / "file", tmp_path / "file" / "out"):
+        told = f"{output}: {tmp_path}/file is a file; choose another --output"
+        assert refused(evaluate.main, options(output=output)) == told
+
+
+def test_a_damaged_policy_is_told(refused, options, base_run, tmp_path):
+    copy = Path(shutil.copytree(base_run.checkpoint(4), tmp_path / "copy"))
+    (copy / "policy" / "manifest.ocdbt").unlink()
+    told = f"{copy}/policy/manifest.ocdbt: missing; the checkpoint cannot be used"
+    assert refused(evaluate.main, options(checkpoint=copy)) == told
+
+
+def test_mjx_is_accepted(base_run):
+    from forgetmimic_jax.checkpoint import read_info
+
+    options = parse(evaluate.Options, "evaluate", ["--physics", "mjx"])
+    config = on_engine(read_info(base_run.checkpoint(4)).config, options.physics)
+    assert resolve_engine(config.physics.engine) == "mjx"
