@@ -1,0 +1,228 @@
+"""The refinement of a retargeted clip: derivatives, the solver and the floor's forces against independent answers."""
+
+import json
+
+import mujoco
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from forgetmimic_jax.motion.contact import floor_points, floor_positions, human_contact
+from forgetmimic_jax.motion.cycle import resampled
+from forgetmimic_jax.motion.deepmimic import LEG_LENGTH, forward_kinematics, read_deepmimic
+from forgetmimic_jax.motion.dynamics import FRICTION, RADIUS, floor_answer, floor_wrench
+from forgetmimic_jax.motion.kinematics import PlanarTransform, generalized_velocity, heading
+from forgetmimic_jax.motion.least_squares import Term, gauss_newton_step
+from forgetmimic_jax.motion.refine import Weights, _Problem, refine
+from forgetmimic_jax.motion.retarget import inverse_kinematics, leg_scale, make_targets
+from forgetmimic_jax.motion.timeline import Timeline
+
+FPS = 50.0
+
+
+def human(tmp_path, frames, *, loop="none", yaw=0.0, height=LEG_LENGTH, pitch=0.0, wave=0.1, travel=0.0):
+    """A human at 50 frames per s who turns by `yaw` rad and moves by `travel` m in all, limbs waving by `wave` rad."""
+    rows = []
+    for row in range(frames):
+        angle = wave * np.sin(2.0 * np.pi * row / (frames - 1))
+        turn = Rotation.from_rotvec([0.0, yaw * row / (frames - 1), 0.0]) * Rotation.from_rotvec([0.0, 0.0, pitch])
+        limb = Rotation.from_rotvec([0.3 * angle, angle, angle]).as_quat(scalar_first=True).tolist()
+        unit = [1.0, 0.0, 0.0, 0.0]
+        leg, arm = [*limb, -abs(angle), *unit], [*limb, abs(angle)]
+        root = [1 / FPS, travel * row / (frames - 1), height, 0.0, *turn.as_quat(scalar_first=True)]
+        rows.append([*root, *limb, *unit, *leg, *arm, *leg, *arm])
+    path = tmp_path / "humanoid3d_made.txt"
+    path.write_text(json.dumps({"Loop": loop, "Frames": rows}))
+    return read_deepmimic(path)
+
+
+def problem_of(robot, motion, weights=None):
+    moved, step = resampled(motion, FPS, 1.0)
+    pose = forward_kinematics(moved)
+    targets = make_targets(robot, pose)
+    if step is not None:
+        step = PlanarTransform(step.yaw, step.shift * leg_scale(robot))
+    timeline = Timeline(targets.num_frames, step)
+    contact = human_contact(pose, FPS)
+    problem = _Problem(robot, targets, contact, floor_points(robot), FPS, timeline, weights or Weights(), 0.02, 0.8)
+    return problem, inverse_kinematics(robot, targets)
+
+
+@pytest.mark.parametrize("loop", ["none", "wrap"])
+def test_jacobians_are_the_residuals_slopes(robot, tmp_path, loop):
+    """Along a random direction, by central differences; on a circle whose cycle turns by 60 degrees, too."""
+    problem, qpos = problem_of(robot, human(tmp_path, 9, loop=loop, yaw=np.radians(60.0), travel=0.2))
+    rng = np.random.default_rng(0)
+    qpos = problem.moved(qpos, 0.002 * rng.normal(size=(len(qpos), robot.model.nv)))
+    direction = rng.normal(size=(len(qpos), robot.model.nv))
+    size = 1e-6
+    here = problem.terms(qpos)
+    plus, minus = (problem.terms(problem.moved(qpos, sign * size * direction)) for sign in (1.0, -1.0))
+    checked = 0
+    for term, after, before in zip(here, plus, minus, strict=True):
+        slope = (after.residual - before.residual) / (2.0 * size)
+        steps = [direction[(term.frame + offset) % len(qpos)] for offset in term.jacobians]
+        found = sum(
+            np.einsum("tmi,ti->tm", jacobian, step)
+            for jacobian, step in zip(term.jacobians.values(), steps, strict=True)
+        )
+        if not np.any(slope):
+            continue
+        # Orientation errors of some 0.1 rad and the momentum matrix are linearised, the rest is exact.
+        exact = np.linalg.norm(found - slope) / np.linalg.norm(slope)
+        assert exact < (0.5 if term.residual.shape[1] == 6 else 0.1)
+        checked += exact < 1e-4
+    assert checked >= 15
+
+
+@pytest.mark.parametrize("cyclic", [False, True])
+@pytest.mark.parametrize("frames", [7, 8, 12])
+def test_banded_step_is_the_dense_least_squares_solution(cyclic, frames):
+    rng = np.random.default_rng(frames)
+    nv, damping = 3, 0.1
+    terms, rows, residuals = [], [], []
+    for reach in (0, 1, 3):
+        first = np.arange(frames if cyclic else frames - reach)
+        jacobians = {offset: rng.normal(size=(len(first), 2, nv)) for offset in range(reach + 1)}
+        term = Term(first, rng.normal(size=(len(first), 2)), jacobians)
+        terms.append(term)
+        for row, frame in enumerate(first):
+            for line in range(2):
+                dense = np.zeros((frames, nv))
+                for offset, jacobian in jacobians.items():
+                    dense[(frame + offset) % frames] += jacobian[row, line]
+                rows.append(dense.reshape(-1))
+                residuals.append(term.residual[row, line])
+    stacked = np.concatenate([rows, np.sqrt(damping) * np.eye(frames * nv)])
+    expected = np.linalg.lstsq(stacked, -np.concatenate([residuals, np.zeros(frames * nv)]), rcond=None)[0]
+    step = gauss_newton_step(terms, frames, nv, cyclic, damping)
+    np.testing.assert_allclose(step.reshape(-1), expected, atol=1e-9)
+
+
+def test_the_floor_carries_what_stands_over_its_points():
+    """Four corners 0.1 m around, the centre of mass 0.6 m up: the pyramid and the lever settle each case by hand."""
+    corners = np.array([[0.1, 0.1], [0.1, -0.1], [-0.1, 0.1], [-0.1, -0.1]])
+
+    def missing(force, offset=0.0, touching=True):
+        levers = np.concatenate([corners - [offset, 0.0], np.full((4, 1), -0.6)], axis=1)[None]
+        needed = np.array([[*force, 0.0, 0.0, 0.0]])
+        given, project = floor_answer(needed, levers, np.full((1, 4), touching))
+        assert np.abs(project[0] @ given[0]).max() < 1e-9
+        return needed[0] - given[0]
+
+    np.testing.assert_allclose(missing([0, 0, 9.81]), 0.0, atol=1e-9)
+    np.testing.assert_allclose(missing([0, 0, 9.81], offset=0.09), 0.0, atol=1e-9)
+    assert np.linalg.norm(missing([0, 0, 9.81], offset=0.15)) > 0.5
+    np.testing.assert_allclose(missing([0, 0, 9.81], touching=False), [0, 0, 9.81, 0, 0, 0])
+    # A push of a_x needs the pressure a_x z / g behind the centre of mass: 0.098 m at 1.6, past the edge at 2.
+    np.testing.assert_allclose(missing([1.6, 0, 9.81]), 0.0, atol=1e-9)
+    assert np.linalg.norm(missing([2.0, 0, 9.81])) > 0.02
+    # Beyond friction, whatever the lever.
+    low = np.concatenate([corners, np.full((4, 1), -1e-6)], axis=1)[None]
+    for share, possible in ((0.9, True), (1.5, False)):
+        needed = np.array([[share * FRICTION * 9.81, 0.0, 9.81, 0.0, 0.0, 0.0]])
+        left = np.linalg.norm(needed - floor_answer(needed, low, np.ones((1, 4), bool))[0])
+        assert (left < 1e-3) == possible
+
+
+def wrench_of(robot, qpos, *, flight):
+    problem = _Problem(robot, None, None, floor_points(robot), FPS, Timeline(len(qpos), None), Weights(), 0.02, 0.8)
+    pose = problem.pose(qpos)
+    points = pose.points[:, robot.model.nbody :]
+    mass = float(robot.model.body_subtreemass[1])
+    flying = np.full(len(qpos), flight)
+    return floor_wrench(
+        problem.timeline, qpos, pose.com, pose.com_jac, pose.momentum, points, flying, mass, FPS, 1e-3
+    ), pose
+
+
+def test_free_fall_and_standing_need_nothing(robot):
+    time = np.arange(10) / FPS
+    qpos = np.zeros((10, robot.model.nq))
+    qpos[:, 3] = 1.0
+    qpos[:, 7:] = np.asarray(robot.arrays.default_joint_pos)
+    points = floor_points(robot)
+    qpos[:, 2] -= floor_positions(robot, points, qpos)[:, points.is_sole, 2].min()
+    standing, _ = wrench_of(robot, qpos, flight=False)
+    np.testing.assert_allclose(standing.residual, 0.0, atol=1e-9)
+    assert np.abs(wrench_of(robot, qpos, flight=True)[0].residual).max() > 1e-3  # nothing holds it up
+    qpos[:, 0] += 1.5 * time
+    qpos[:, 2] += 0.5 + 2.0 * time - 0.5 * 9.81 * time**2
+    falling, _ = wrench_of(robot, qpos, flight=True)
+    np.testing.assert_allclose(falling.residual, 0.0, atol=1e-9)
+
+
+def test_the_momentum_is_mujocos(robot):
+    """The wrench's moment is the change of mj_subtreeVel's angular momentum."""
+    rng = np.random.default_rng(1)
+    time = np.arange(40)[:, None] / FPS
+    wave = 0.3 * np.sin(3.0 * time + rng.normal(size=(1, robot.num_joints)))
+    turns = Rotation.from_rotvec(time * [0.3, 1.0, 0.5]).as_quat(scalar_first=True)
+    qpos = np.concatenate([np.tile([0.0, 0.0, 2.0], (40, 1)), turns, wave], axis=1)
+    term, _ = wrench_of(robot, qpos, flight=True)
+    qvel = generalized_velocity(qpos, FPS)
+    data, momentum = mujoco.MjData(robot.model), []
+    for row in range(40):
+        data.qpos[:], data.qvel[:] = qpos[row], qvel[row]
+        mujoco.mj_forward(robot.model, data)
+        mujoco.mj_subtreeVel(robot.model, data)
+        momentum.append(data.subtree_angmom[1].copy())
+    expected = np.gradient(momentum, 1.0 / FPS, axis=0)[term.frame + 1] / robot.model.body_subtreemass[1] / RADIUS
+    residual = term.residual / np.linalg.norm(term.residual, axis=1, keepdims=True)  # the robust weight is a factor
+    force = residual[:, 2:3]
+    # The vertical force on a body whose centre of mass hardly accelerates is g: it sets the scale.
+    com_acc = wrench_scale(robot, qpos)[term.frame]
+    np.testing.assert_allclose((residual[:, 3:] / force * com_acc)[2:-2], expected[2:-2], atol=0.02)
+
+
+def wrench_scale(robot, qpos):
+    """Vertical acceleration that holds up each inner frame's centre of mass [row, 1], by differences."""
+    data, heights = mujoco.MjData(robot.model), []
+    for row in qpos:
+        data.qpos[:] = row
+        mujoco.mj_kinematics(robot.model, data)
+        mujoco.mj_comPos(robot.model, data)
+        heights.append(data.subtree_com[1][2])
+    return (np.diff(heights, n=2) * FPS**2 + 9.81)[:, None]
+
+
+def test_contacts_of_a_human_who_stands_floats_and_lies(tmp_path):
+    standing = human_contact(forward_kinematics(human(tmp_path, 6, wave=0.0)), FPS)
+    assert not standing.flight.any()
+    np.testing.assert_allclose(standing.planted["left_heel"], 1.0)
+    assert not standing.planted["left_hand"].any()
+    floating = human_contact(forward_kinematics(human(tmp_path, 6, wave=0.0, height=LEG_LENGTH + 0.2)), FPS)
+    assert floating.flight.all()
+    assert not any(weight.any() for weight in floating.planted.values())
+    lying = human_contact(forward_kinematics(human(tmp_path, 6, wave=0.0, height=0.12, pitch=np.pi / 2)), FPS)
+    assert not lying.flight.any()
+    assert (lying.planted["torso"] > 0.1).all()
+
+
+@pytest.mark.parametrize(("degrees", "carried"), [(10.0, 0.0), (60.0, 60.0)])
+def test_a_cycle_closes(tmp_path, degrees, carried):
+    """A small turn is a recording's fault and is spread; a large one is carried from cycle to cycle."""
+    moved, step = resampled(human(tmp_path, 41, loop="wrap", yaw=np.radians(degrees), travel=0.2), FPS, 1.0)
+    assert len(moved.times) == 40
+    assert np.degrees(step.yaw) == pytest.approx(carried, abs=1e-6)
+    root = moved.rotations["root"]
+    turned = np.degrees(np.unwrap(heading(root)))
+    assert turned[-1] - turned[0] == pytest.approx(carried * 39 / 40, abs=0.6)
+    seam = (step.turn(root[0]) * root[-1].inv()).magnitude()
+    inside = (root[1:] * root[:-1].inv()).magnitude().max()
+    assert seam < 1.5 * inside + 1e-3
+
+
+def test_a_standing_human_makes_a_standing_robot(robot, tmp_path):
+    """Both soles on the floor and still, the centre of mass over them, joints inside their limits."""
+    problem, start = problem_of(robot, human(tmp_path, 12, wave=0.005))
+    qpos = refine(
+        robot, problem.targets, problem.contact, problem.floor, start, FPS, problem.timeline.step, iterations=15
+    )
+    soles = floor_positions(robot, problem.floor, qpos)[:, problem.floor.is_sole]
+    assert np.abs(soles[..., 2]).max() < 0.005
+    assert (qpos[:, 7:] > robot.joint_lower).all()
+    assert (qpos[:, 7:] < robot.joint_upper).all()
+    com = problem.pose(qpos).com
+    assert (com[:, :2] > soles[..., :2].min(axis=1)).all()
+    assert (com[:, :2] < soles[..., :2].max(axis=1)).all()
