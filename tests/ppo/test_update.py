@@ -18,6 +18,7 @@ from forgetmimic_jax.tracking.env import Assets, Environment, make_assets
 from forgetmimic_jax.unlearning.antireward import unlearning_config
 
 ENVS, STEPS, CONTROL_STEP = 8, 4, 0.02
+PHASE = 571  # the clip's phase in the critic's observation
 
 
 @dataclass
@@ -138,6 +139,25 @@ def test_collected_actions_have_the_density_of_the_policy(run, trajectory):
 def test_the_value_of_the_state_reached_is_the_next_steps_value_until_the_episode_ends(trajectory):
     goes_on = ~(trajectory.terminated | trajectory.truncated)[:-1]
     np.testing.assert_allclose(trajectory.next_value[:-1][goes_on], trajectory.value[1:][goes_on], atol=1e-4)
+
+
+def test_the_value_after_an_episodes_last_step_is_of_the_state_it_ended_in(run, library):
+    state = run.start()
+    # A critic that tells the clip's phase, and episodes of which every other one ends with its first step.
+    critic = jax.tree.map(jnp.zeros_like, state.policy.critic)
+    layers = critic["params"]["MLP_0"]
+    layers["Dense_0"]["kernel"] = layers["Dense_0"]["kernel"].at[PHASE, 0].set(1.0)
+    layers["Dense_1"]["kernel"] = layers["Dense_1"]["kernel"].at[0, 0].set(1.0)
+    horizon = state.env.horizon.at[::2].set(1)
+    state = dataclasses.replace(
+        state,
+        policy=dataclasses.replace(state.policy, critic=critic),
+        env=dataclasses.replace(state.env, horizon=horizon),
+    )
+    trajectory = jax.device_get(run.collect(run.assets, state)[1])
+    assert trajectory.truncated[0, ::2].all()
+    one_frame = 1.0 / np.asarray(library.length)[trajectory.clip]
+    np.testing.assert_allclose(trajectory.next_value - trajectory.value, one_frame, atol=1e-5)
 
 
 def test_the_training_reward_is_per_control_step_and_turned_round_on_target_steps(trajectory):

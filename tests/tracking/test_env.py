@@ -279,6 +279,19 @@ def test_a_diverged_robot_is_seen_and_its_reward_is_zero(native, assets, kind):
     assert np.isfinite(after.terms).all()
 
 
+def test_a_diverged_robot_stays_where_it_was(puppet_env, assets):
+    state = start(puppet_env, assets, [0] * ENVS, [5] * ENVS)
+    physics, bodies = on_frame(puppet_env, assets, state.clip, state.frame + 1)
+    puppet_env.engine.next_physics = dataclasses.replace(physics, qvel=physics.qvel.at[1, 0].set(jnp.nan))
+    puppet_env.engine.next_bodies = bodies
+    after, _ = tracking.step(puppet_env, assets, state, jnp.zeros((ENVS, 29)), KEY)
+    for old, new in zip(
+        jax.tree.leaves((state.physics, state.bodies)), jax.tree.leaves((after.physics, after.bodies)), strict=True
+    ):
+        np.testing.assert_array_equal(old[1], new[1])
+    np.testing.assert_array_equal(after.physics.qpos[0], physics.qpos[0])
+
+
 def test_a_diverged_robot_is_whole_again_after_its_reset(native, assets):
     env, step = native
     state = poisoned(start(env, assets, [0] * ENVS, [0] * ENVS), "nan")
