@@ -1,11 +1,13 @@
 """The loop around the iterations, here ones that only count: what is saved, logged, resumed and said at a stop."""
 
+import contextlib
 import dataclasses
 import errno
 import json
 import os
 import signal
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -189,7 +191,9 @@ def test_a_second_stop_does_not_wait(run):
     assert names(run.folder) == ["00000000", "00000015"]
 
 
-def fail_to_save(monkeypatch, at: int) -> None:
+@contextlib.contextmanager
+def full_disk(at: int) -> Iterator[None]:
+    """The system refuses to save iteration `at`."""
     save = checkpoint.save_checkpoint
 
     def failing(path, *arguments, **options):
@@ -197,21 +201,20 @@ def fail_to_save(monkeypatch, at: int) -> None:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
         save(path, *arguments, **options)
 
-    monkeypatch.setattr(checkpoint, "save_checkpoint", failing)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(checkpoint, "save_checkpoint", failing)
+        yield
 
 
-def test_a_disk_that_fills_up_leaves_the_checkpoints_before(run, monkeypatch):
-    fail_to_save(monkeypatch, at=30)
-    with pytest.raises(OSError, match="No space left on device"):
+def test_a_disk_that_fills_up_leaves_the_checkpoints_before(run):
+    with full_disk(at=30), pytest.raises(OSError, match="No space left on device"):
         run()
     assert names(run.folder) == ["00000000", "00000015"]
-    monkeypatch.undo()
     assert run(resume=True, iterations=16)[1].iteration == 16
 
 
-def test_a_run_that_cannot_save_at_all_leaves_no_folder(run, monkeypatch):
-    fail_to_save(monkeypatch, at=0)
-    with pytest.raises(OSError, match="No space left on device"):
+def test_a_run_that_cannot_save_at_all_leaves_no_folder(run):
+    with full_disk(at=0), pytest.raises(OSError, match="No space left on device"):
         run()
     assert not run.folder.exists()
 
