@@ -106,6 +106,7 @@ Command = (
 )
 
 
+@tyro.conf.configure(tyro.conf.CascadeSubcommandArgs)  # --robot before or after the command's name
 @dataclass
 class Options:
     """Make, check and look at libraries of motion clips. `motions import --help` and so on tell a command's flags."""

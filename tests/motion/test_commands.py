@@ -121,6 +121,12 @@ def test_retarget_spares_what_is_there(run, tmp_path):
     assert (code, "--force" in err) == (2, True)
 
 
+def test_the_robot_is_named_before_or_after_the_command(run):
+    for arguments in (("--robot", "g7", "list"), ("list", "--robot", "g7")):
+        code, _, err = run(*arguments)
+        assert (code, "robot 'g7'" in err) == (2, True)
+
+
 @pytest.mark.parametrize("command", [(), ("import",), ("retarget",), ("check",), ("show",), ("list",)])
 def test_help_tells_every_flag_and_its_default(run, command):
     code, out, _ = run("--robot", "g1", *command, "--help")
