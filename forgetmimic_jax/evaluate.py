@@ -47,6 +47,8 @@ def main(options: Options) -> None:
         output = options.output
     elif path.parent.name == "checkpoints":
         output = path.parent.parent
+    elif (path.parent / "checkpoints").is_dir():
+        output = path.parent
     else:
         output = Path("runs") / f"evaluate-{options.robot}"
     runner.check_writable(output)

@@ -27,10 +27,10 @@ from forgetmimic_jax.config import Config, save_config, validate
 from forgetmimic_jax.console import progress
 from forgetmimic_jax.errors import InputError, Interrupted, nearest
 from forgetmimic_jax.evaluation.watch import Watch
-from forgetmimic_jax.motion.clip import write_atomically
 from forgetmimic_jax.motion.library import DATA_DIR, MotionLibrary, library_hash, load_library, read_manifest
 from forgetmimic_jax.ppo.update import make_iteration
 from forgetmimic_jax.robot import Robot, load_robot, roles_file
+from forgetmimic_jax.rows import drop_rows_after
 from forgetmimic_jax.state import TrainState, init_state
 from forgetmimic_jax.tracking.env import Assets, Environment, make_assets, make_environment
 
@@ -210,8 +210,9 @@ def run(
     saved = newest
 
     def save(best: bool = False) -> Path:
-        # A row never spans a checkpoint: what is resumed has all of its rows in the file.
-        log.write(iteration, environment_steps, setup.library.names)
+        if not best:
+            # A row never spans a checkpoint: what is resumed has all of its rows in the file.
+            log.write(iteration, environment_steps, setup.library.names)
         path = directory / BEST if best else directory / "checkpoints" / f"{iteration:08d}"
         checkpoint.save_checkpoint(
             path,
@@ -245,12 +246,12 @@ def run(
                 if iteration % LOG_EVERY == 0:
                     log.write(iteration, environment_steps, setup.library.names)
                 report(iteration, environment_steps, _live(metrics))
-                if iteration % config.checkpoint_every == 0:
-                    saved = save()
                 if watch and iteration % config.evaluate_every == 0:
                     if watch(state.policy, iteration, environment_steps):
                         save(best=True)
                     console.print(watch.table())
+                if iteration % config.checkpoint_every == 0:
+                    saved = save()  # after the evaluation, which a run that is resumed from here does not make again
             if int(saved.name) != iteration:
                 saved = save()
     except BaseException as error:
@@ -294,7 +295,7 @@ class _Log:
     def __init__(self, directory: Path, iteration: int, environment_steps: int):
         # TensorboardX's SummaryWriter writes from a thread, for which a run would wait forever when the disk is full.
         path = directory / "metrics.jsonl"
-        _drop_rows_after(path, iteration)
+        drop_rows_after(path, iteration)
         self._file = path.open("a")
         (directory / "events").mkdir(exist_ok=True)
         self._events = EventsWriter(str(directory / "events" / "events"))
@@ -344,18 +345,6 @@ class _Log:
     def _write_event(self, step: int, **content: Any) -> None:
         self._events.write_event(Event(wall_time=time.time(), step=step, **content))
         self._events.flush()
-
-
-def _drop_rows_after(path: Path, iteration: int) -> None:
-    """Rows after the checkpoint that is resumed from would be logged twice; a killed run may end in half a row."""
-    if not path.exists():
-        return
-    kept = []
-    for line in path.read_text().splitlines():
-        with contextlib.suppress(ValueError):
-            if json.loads(line)["iteration"] <= iteration:
-                kept.append(line)
-    write_atomically(path, "".join(f"{line}\n" for line in kept).encode())
 
 
 @contextlib.contextmanager

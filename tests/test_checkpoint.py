@@ -1,6 +1,7 @@
 """A checkpoint appears whole or not at all, goes back bit for bit, and says which part of it is not what was asked."""
 
 import dataclasses
+import errno
 import json
 import resource
 import shutil
@@ -98,6 +99,15 @@ def test_what_the_system_refuses_is_an_oserror_and_leaves_nothing(tmp_path, save
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, unlimited)
     assert refusal.value.filename == str(tmp_path / "00000009")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_is_told_before_anything_is_written(tmp_path, state, setup, monkeypatch):
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _path: usage._replace(free=2**20))
+    with pytest.raises(OSError, match=r"No space left on device: \d+ MiB are needed") as refusal:
+        save(tmp_path / "00000009", state, setup)
+    assert (refusal.value.errno, refusal.value.filename) == (errno.ENOSPC, str(tmp_path))
     assert list(tmp_path.iterdir()) == []
 
 

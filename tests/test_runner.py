@@ -3,8 +3,8 @@
 import contextlib
 import dataclasses
 import errno
-import json
 import os
+import shutil
 import signal
 import struct
 from collections.abc import Iterator
@@ -18,6 +18,9 @@ from tensorboardX.proto.event_pb2 import Event
 
 from forgetmimic_jax import checkpoint, runner
 from forgetmimic_jax.errors import InputError, Interrupted
+from forgetmimic_jax.evaluation import watch
+from forgetmimic_jax.evaluation.metrics import Rollout
+from forgetmimic_jax.rows import read_rows
 
 CLIPS = 3
 
@@ -65,7 +68,7 @@ def run(setup, tmp_path, monkeypatch):
 
 
 def rows(folder: Path) -> list[dict]:
-    return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    return read_rows(folder / "metrics.jsonl")
 
 
 def names(folder: Path) -> list[str]:
@@ -135,6 +138,46 @@ def test_a_killed_run_goes_on_from_its_newest_whole_checkpoint(run):
     assert rows(run.folder)[:-1] == expected
     assert rows(run.folder)[-1]["iteration"] == 21
     assert checkpoint.read_info(path).environment_steps == 21 * 32
+
+
+@pytest.fixture
+def skill(monkeypatch) -> list[float]:
+    """The survival-weighted tracking that one evaluation after the other finds."""
+    found = []
+
+    class Evaluator:
+        def __init__(self, *_arguments, episodes, seed):
+            pass
+
+        def rollout(self, _policy) -> Rollout:
+            one = np.ones(CLIPS, int)
+            reward = np.full((CLIPS, 1), found.pop(0))
+            return Rollout(np.arange(CLIPS), 0 * one, horizon=one, length=one, tracking_reward=reward)
+
+    monkeypatch.setattr(watch, "Evaluator", Evaluator)
+    return found
+
+
+def test_the_best_policy_is_kept_too_also_over_a_resume(run, skill):
+    def evaluations():
+        rows = read_rows(run.folder / "evaluations.jsonl")
+        return {row["iteration"]: row["survival_weighted_tracking"] for row in rows}
+
+    skill += [0.25, 0.5, 0.375]
+    run(evaluate_every=10, iterations=30)
+    assert evaluations() == {10: 0.25, 20: 0.5, 30: 0.375}
+    best = run.folder / "best"
+    assert checkpoint.read_info(best).iteration == 20
+    assert not (best / "run").exists()
+    assert runner.prepare_folder(run.folder, resume=True).name == "00000030"
+
+    shutil.rmtree(run.folder / "checkpoints" / "00000030")  # as if killed before it was whole: 15 is the newest
+    with (run.folder / "evaluations.jsonl").open("a") as file:
+        file.write('{"iteration": 40, "cl')
+    skill += [0.5, 0.4375, 0.75]
+    run(evaluate_every=10, resume=True)
+    assert evaluations() == {10: 0.25, 20: 0.5, 30: 0.4375, 40: 0.75}
+    assert checkpoint.read_info(best).iteration == 40
 
 
 def test_a_finished_run_resumes_to_its_own_end(run):

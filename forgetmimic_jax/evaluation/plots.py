@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from forgetmimic_jax.errors import InputError
 from forgetmimic_jax.evaluation.tables import clip_order, policy_order
+from forgetmimic_jax.rows import read_rows
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -54,7 +54,7 @@ def training_curves(metrics_file: Path, path: Path, *, keys: Sequence[str] | Non
     Raises:
         InputError: no line to draw, or a key that no line has.
     """
-    lines = [json.loads(line) for line in metrics_file.read_text().splitlines() if line.strip()]
+    lines = read_rows(metrics_file)
     present = sorted({key for line in lines for key, value in line.items() if isinstance(value, int | float)})
     keys = [key for key in present if key not in STEPS] if keys is None else keys
     missing = [key for key in keys if key not in present]

@@ -11,6 +11,7 @@ from forgetmimic_jax.evaluation.metrics import episode_metrics
 from forgetmimic_jax.evaluation.rollout import Evaluator
 from forgetmimic_jax.motion.library import MotionLibrary
 from forgetmimic_jax.robot import Robot
+from forgetmimic_jax.rows import drop_rows_after, read_rows
 from forgetmimic_jax.state import Policy
 
 FILE = "evaluations.jsonl"
@@ -25,8 +26,7 @@ class Watch:
         self._evaluator = Evaluator(config, robot, library, episodes=EPISODES, seed=config.seed)
         self._names = library.names
         self._path = directory / FILE
-        rows = read_rows(self._path, iteration)
-        self._path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+        rows = drop_rows_after(self._path, iteration)
         self._best = max((row["survival_weighted_tracking"] for row in rows), default=-1.0)
 
     def __call__(self, policy: Policy, iteration: int, environment_steps: int) -> bool:
@@ -58,11 +58,3 @@ class Watch:
             cells = [row["clips"][clip] for row in rows]
             table.add_row(clip, *(f"{c['success_rate']:.0%} ({c['survival_weighted_tracking']:.2f})" for c in cells))
         return table
-
-
-def read_rows(path: Path, up_to: int | None = None) -> list[dict[str, Any]]:
-    """The rows of evaluations.jsonl, those after iteration `up_to` left out (they will be made again)."""
-    if not path.exists():
-        return []
-    rows = [json.loads(line) for line in path.read_text().splitlines()]
-    return [row for row in rows if up_to is None or row["iteration"] <= up_to]
