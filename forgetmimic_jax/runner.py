@@ -259,6 +259,8 @@ def run(
             shutil.rmtree(directory, ignore_errors=True)  # nothing in it to go on with
         elif isinstance(error, KeyboardInterrupt):
             raise interrupted(config, directory) from None
+        elif isinstance(error, OSError) and error.filename is None:
+            error.filename = str(directory)  # a full disk does not say where
         raise
     if stop:
         raise interrupted(config, directory)

@@ -59,10 +59,10 @@ def main(options: Options) -> None:
     config = override(replace_given(config, iterations=options.iterations), itertools.chain(*options.set))
     setup = runner.make_setup(on_engine(config, options.physics))
     path, _ = runner.run(setup, output, description=f"train {config.robot}", resume=options.resume)
-    closing(
-        {"checkpoint": path, "curves": output / "metrics.jsonl", "TensorBoard": output / "events"},
-        f"make evaluate ROBOT={config.robot} CHECKPOINT={path}",
-    )
+    best = output / runner.BEST
+    files = {"checkpoint": path} | ({"best policy": best} if best.is_dir() else {})
+    files |= {"curves": output / "metrics.jsonl", "TensorBoard": output / "events"}
+    closing(files, f"make evaluate ROBOT={config.robot} CHECKPOINT={files.get('best policy', path)}")
 
 
 if __name__ == "__main__":

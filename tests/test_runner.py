@@ -256,6 +256,17 @@ def test_a_disk_that_fills_up_leaves_the_checkpoints_before(run):
     assert run(resume=True, iterations=16)[1].iteration == 16
 
 
+def test_a_row_that_does_not_fit_is_told_with_its_folder(run, monkeypatch):
+    def full(*_arguments):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    run.before[12] = lambda: monkeypatch.setattr(runner._Log, "write", full)
+    with pytest.raises(OSError, match="No space left on device") as refusal:
+        run()
+    assert refusal.value.filename == str(run.folder)
+    assert names(run.folder) == ["00000000"]
+
+
 def test_a_run_that_cannot_save_at_all_leaves_no_folder(run):
     with full_disk(at=0), pytest.raises(OSError, match="No space left on device"):
         run()
@@ -276,6 +287,12 @@ def test_a_folder_must_be_new(tmp_path):
     for path in (tmp_path / "note", tmp_path / "note" / "below" / "it"):
         with pytest.raises(InputError, match=rf"^{path}: {tmp_path}/note is a file; choose another --output$"):
             runner.prepare_folder(path, resume=False)
+
+
+def test_a_folder_without_permission_is_told(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "access", lambda _path, _mode: False)  # which root would have everywhere
+    with pytest.raises(InputError, match=rf"no permission to write in {tmp_path}; choose another --output"):
+        runner.prepare_folder(tmp_path / "run", resume=False)
 
 
 def test_nothing_to_resume_is_told(tmp_path):
