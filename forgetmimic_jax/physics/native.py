@@ -43,7 +43,7 @@ class NativeEngine:
         self._anchor = robot.anchor_body_id
         self._torso_com = model.body_ipos[self._anchor].copy()
         self._feet = robot.foot_geom_ids
-        self._everyone = np.arange(num_envs)
+        self._everyone = slice(None)
         self._contact_columns = contact_sensor_columns(robot)
         self._outputs = {
             name: self._batch.bind(name) for name in ("xpos", "xquat", "cvel", "subtree_com", "sensordata")
@@ -86,7 +86,8 @@ class NativeEngine:
         batch.qpos[rows] = qpos[rows]
         batch.qvel[rows] = qvel[rows]
         batch.qacc_warmstart[rows] = warmstart[rows]
-        self._friction[rows[:, None], self._feet, 0] = friction[rows, None]
+        for geom in self._feet:
+            self._friction[rows, geom, 0] = friction[rows]
         self._body_ipos[rows, self._anchor] = self._torso_com + torso_com[rows]
 
     def _bodies(self, rows) -> tuple[np.ndarray, ...]:
