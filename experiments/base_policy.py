@@ -25,7 +25,8 @@ AT = (200_000, 400_000, 600_000, 800_000)
 TEXT = """# What makes the base train faster: first trials
 
 Mean episode length (control steps, exploration noise included) of single short trials on the twelve G1 clips, seed 0,
-by environment steps. One seed each and a first version of the clip library (later refined), so a difference of a step
+by environment steps. The trials with `initial_std=0.5` ran before the root-velocity and torque terms of the reward were
+corrected. One seed each and a first version of the clip library (later refined), so a difference of a step
 or two means nothing. All with the cpu preset and `{shared}`.
 Curves: `results/base_policy/`; this page and its figure: `python experiments/base_policy.py`.
 
