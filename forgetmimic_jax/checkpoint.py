@@ -97,6 +97,8 @@ def save_checkpoint(
             for name, tree in trees.items():
                 checkpointer.save((temporary / name).resolve(), tree)
                 checkpointer.wait_until_finished()
+                # Orbax notes there where the folder was written, which is nobody else's business; it is not read back.
+                (temporary / name / "commit_success.txt").unlink(missing_ok=True)
         meta["files"] = _hashes(temporary)
         save_config(config, temporary / CONFIG)
         (temporary / META).write_text(json.dumps(meta, indent=2) + "\n")
