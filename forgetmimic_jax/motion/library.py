@@ -47,10 +47,6 @@ class MotionLibrary:
     anchor_ang_acc: Array  # f32[clip, frame, 3] rad/s^2, norm at most 100
     names: tuple[str, ...] = struct.field(pytree_node=False)
 
-    @property
-    def num_clips(self) -> int:
-        return len(self.names)
-
 
 def build_library(robot: Robot, clips: Sequence[Clip], fps: float = 50.0) -> MotionLibrary:
     """Resample clips to the control rate `fps` in Hz, derive body motion, and pad.

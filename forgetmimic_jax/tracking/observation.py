@@ -6,7 +6,6 @@ The reference shown is the frame that the next action is to reach.
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -14,21 +13,8 @@ from forgetmimic_jax import rotation
 from forgetmimic_jax.config import NoiseConfig
 from forgetmimic_jax.physics import BodyState, PhysicsState
 from forgetmimic_jax.robot import RobotArrays
+from forgetmimic_jax.tracking.randomise import symmetric
 from forgetmimic_jax.tracking.reference import Reference
-
-# Names and order of the actor's observation, for export.
-ACTOR_TERMS = (
-    "reference_base_height",
-    "reference_base_linear_velocity",
-    "reference_base_angular_velocity",
-    "reference_projected_gravity",
-    "reference_joint_position",
-    "gyro",
-    "projected_gravity",
-    "joint_position",
-    "joint_velocity",
-    "last_action",
-)
 
 
 def actor_size(num_joints: int) -> int:
@@ -85,7 +71,7 @@ def observation_noise(config: NoiseConfig, key: Array, num_envs: int, num_joints
             jnp.zeros(joints),
         ]
     )
-    return half_width * jax.random.uniform(key, (num_envs, half_width.size), minval=-1.0, maxval=1.0)
+    return symmetric(key, num_envs, half_width)
 
 
 def critic_observation(
