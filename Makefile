@@ -11,7 +11,7 @@
 ## ITERATIONS   training iterations
 ## SEED         random seed
 ## BASE         the policy to start from (default: the shipped one; for pretrain, none)
-## CHECKPOINT   the policy to evaluate
+## CHECKPOINT   the policy to evaluate or export
 ## EPISODES     episodes a clip in an evaluation (default: 20)
 ## OUTPUT       folder for the results (default: a folder under runs/)
 ## RESUME       1 goes on with the run in OUTPUT
@@ -29,7 +29,7 @@ TARGET_FLAGS = $(call flag,targets,TARGETS) $(call flag,episodes,EPISODES)
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help unlearn pretrain evaluate motions bench tables test lint format clean
+.PHONY: help unlearn pretrain evaluate export motions bench tables test lint format clean
 
 help: ## this list
 	@echo 'make TARGET [VARIABLE=value ...]'
@@ -47,6 +47,10 @@ pretrain: .venv/.installed ## train a base policy on every clip
 
 evaluate: .venv/.installed ## evaluate CHECKPOINT clip by clip
 	$(MODULE).evaluate $(strip $(RUN_FLAGS) $(TARGET_FLAGS) $(call flag,checkpoint,CHECKPOINT) $(ARGS))
+
+export: .venv/.installed ## write CHECKPOINT as ONNX for deploy tools, checked in plain MuJoCo
+	$(MODULE).export $(strip --robot $(ROBOT) $(call flag,library,LIBRARY) $(call flag,seed,SEED) \
+		$(call flag,output,OUTPUT) $(call flag,checkpoint,CHECKPOINT) $(call flag,episodes,EPISODES) $(ARGS))
 
 motions: .venv/.installed ## make a library from your own clips (ARGS=--help says how)
 	$(MODULE).motions $(strip --robot $(ROBOT) $(ARGS))

@@ -193,6 +193,12 @@ def check_matches(
             )
 
 
+def policy_hash(info: CheckpointInfo) -> str:
+    """Content hash (16 hex digits) of a checkpoint's policy as it lies on the disk."""
+    policy = {name: sha256 for name, sha256 in info.files.items() if name.startswith(f"{POLICY}/")}
+    return hashlib.sha256(json.dumps(policy, sort_keys=True).encode()).hexdigest()[:16]
+
+
 def load_policy(path: Path, template: TrainState) -> Policy:
     """A checkpoint's networks and normalisers; `template` gives the shapes (`jax.eval_shape` of `init_state`)."""
     return _restore(path, POLICY, {"policy": template.policy})["policy"]

@@ -43,14 +43,7 @@ def main(options: Options) -> None:
     at_least(1, "--episodes", options.episodes)
     at_least(0, "--seed", options.seed)
     path = options.checkpoint or runner.base_folder(options.robot)
-    if options.output:
-        output = options.output
-    elif path.parent.name == "checkpoints":
-        output = path.parent.parent
-    elif (path.parent / "checkpoints").is_dir():
-        output = path.parent
-    else:
-        output = Path("runs") / f"evaluate-{options.robot}"
+    output = options.output or runner.folder_of(path) or Path("runs") / f"evaluate-{options.robot}"
     runner.check_writable(output)
     info = checkpoint.read_info(path)
     config = on_engine(replace_given(info.config, robot=options.robot, library=options.library), options.physics)

@@ -138,6 +138,13 @@ def base_folder(robot: str) -> Path:
     return folder
 
 
+def folder_of(path: Path) -> Path | None:
+    """The run that a checkpoint belongs to, if any."""
+    if path.parent.name == "checkpoints":
+        return path.parent.parent
+    return path.parent if (path.parent / "checkpoints").is_dir() else None
+
+
 def default_folder(kind: str, *, resume: bool) -> Path:
     """The next free folder runs/KIND-NUMBER, or with `resume` the last one."""
     numbers = [int(path.name.rpartition("-")[2]) for path in Path("runs").glob(f"{kind}-[0-9]*")

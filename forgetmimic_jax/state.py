@@ -11,7 +11,7 @@ from flax import struct
 from jax import Array
 
 from forgetmimic_jax.config import Config
-from forgetmimic_jax.ppo.network import Actor, Critic, Normalizer, init_normalizer
+from forgetmimic_jax.ppo.network import Actor, Critic, Normalizer, distribution, init_normalizer, normalize
 from forgetmimic_jax.tracking.env import Assets, Environment, EnvState, observe, reset_where, start_episodes
 from forgetmimic_jax.tracking.rsi import bin_probabilities
 from forgetmimic_jax.tracking.wrench import wrench_gain
@@ -65,6 +65,12 @@ def init_policy(config: Config, num_joints: int, actor_size: int, critic_size: i
         actor_normalizer=init_normalizer(actor_size),
         critic_normalizer=init_normalizer(critic_size),
     )
+
+
+def mean_action(policy: Policy, config: Config, observation: Array) -> Array:
+    """The deterministic action [..., joint] at an actor observation [..., features] as the environment gives it."""
+    actor = make_actor(config, policy.actor["params"]["log_std"].size)
+    return distribution(actor, policy.actor, normalize(policy.actor_normalizer, observation))[0]
 
 
 def init_state(

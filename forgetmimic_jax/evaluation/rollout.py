@@ -16,9 +16,8 @@ from forgetmimic_jax import rotation
 from forgetmimic_jax.config import Config
 from forgetmimic_jax.evaluation.metrics import Rollout
 from forgetmimic_jax.motion.library import MotionLibrary
-from forgetmimic_jax.ppo.network import normalize
 from forgetmimic_jax.robot import Robot
-from forgetmimic_jax.state import Policy, make_actor
+from forgetmimic_jax.state import Policy, mean_action
 from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.tracking.env import Assets, Environment, EnvState, StepResult
 from forgetmimic_jax.tracking.reference import align_to_anchor
@@ -40,10 +39,14 @@ class Evaluator:
         self._begin = jax.jit(self._begin_episodes)
         self._advance = jax.jit(self._advance_chunk)
 
+    def start(self) -> EnvState:
+        """Every episode at its start frame, reset noise included."""
+        return self._begin(self._assets, jax.random.PRNGKey(self._seed))
+
     def rollout(self, policy: Policy | None) -> Rollout:
         """Every episode with `policy`'s mean action; None is the zero action."""
         env = self._env
-        state = self._begin(self._assets, jax.random.PRNGKey(self._seed))
+        state = self.start()
         horizon = np.asarray(state.horizon)
         length = horizon.copy()
         ended = np.zeros(env.num_envs, bool)
@@ -84,14 +87,13 @@ class Evaluator:
 
     def _advance_chunk(self, assets: Assets, policy: Policy | None, state: EnvState):
         env = self._env
-        actor = make_actor(env.config, env.robot.num_joints)
 
         def one_step(state: EnvState, key: Array):
             if policy is None:
                 action = jnp.zeros((env.num_envs, env.robot.num_joints), jnp.float32)
             else:
                 observation = tracking.observe(env, assets, state, None)[0]
-                action = actor.apply(policy.actor, normalize(policy.actor_normalizer, observation))[0]
+                action = mean_action(policy, env.config, observation)
             state, result = tracking.step(env, assets, state, action, key)
             record = step_errors(env, assets, state, result)
             record |= {

@@ -12,6 +12,8 @@ from jax import Array
 
 LOG_2PI = 1.8378770664093453
 MIN_STD, MAX_STD = 0.05, 2.0
+VARIANCE_FLOOR = 1e-6  # added to an observation's variance before dividing by its root
+OBSERVATION_LIMIT = 10.0  # standard deviations
 
 
 class MLP(nn.Module):
@@ -100,7 +102,8 @@ def init_normalizer(size: int) -> Normalizer:
 
 def normalize(normalizer: Normalizer, observation: Array) -> Array:
     """Observation [..., features] with mean 0 and variance 1, clipped to ±10."""
-    return jnp.clip((observation - normalizer.mean) * jax.lax.rsqrt(normalizer.variance + 1e-6), -10.0, 10.0)
+    scaled = (observation - normalizer.mean) * jax.lax.rsqrt(normalizer.variance + VARIANCE_FLOOR)
+    return jnp.clip(scaled, -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
 
 
 def update_normalizer(normalizer: Normalizer, observation: Array, max_count: float = 1e8) -> Normalizer:

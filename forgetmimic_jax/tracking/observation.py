@@ -17,9 +17,25 @@ from forgetmimic_jax.tracking.randomise import symmetric
 from forgetmimic_jax.tracking.reference import Reference
 
 
+def actor_layout(num_joints: int) -> dict[str, int]:
+    """Terms of the actor's observation in their order, name → size. The names are wbc-mjlab's for the same terms."""
+    return {
+        "ref_base_height": 1,
+        "ref_base_lin_vel_b": 3,
+        "ref_base_ang_vel_b": 3,
+        "ref_gravity_b": 3,
+        "ref_joint_pos": num_joints,
+        "base_ang_vel": 3,
+        "projected_gravity": 3,
+        "joint_pos": num_joints,
+        "joint_vel": num_joints,
+        "actions": num_joints,
+    }
+
+
 def actor_size(num_joints: int) -> int:
     """Size of the actor's observation: 132 for 29 joints."""
-    return 16 + 4 * num_joints
+    return sum(actor_layout(num_joints).values())
 
 
 def actor_observation(

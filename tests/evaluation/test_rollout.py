@@ -105,7 +105,7 @@ def test_every_policy_meets_the_same_starts(evaluator, zero_action, policy):
 
 
 def test_a_policy_changes_the_robot_only_after_its_first_action(evaluator):
-    begin = [evaluator._begin(evaluator._assets, jax.random.PRNGKey(0)) for _ in range(2)]
+    begin = [evaluator.start() for _ in range(2)]
     for one, two in zip(*(jax.tree.leaves(state) for state in begin), strict=True):
         np.testing.assert_array_equal(one, two)
 
@@ -156,7 +156,7 @@ def test_episodes_that_blow_up_are_counted_once_each_and_only_while_they_live(ev
 def test_step_errors_by_hand(evaluator, robot):
     """The robot stands 1 m east of the reference, turned by 90°, 2 cm too high, and stands on one foot."""
     envs = 2 * EPISODES
-    assets, state = evaluator._assets, evaluator._begin(evaluator._assets, jax.random.PRNGKey(0))
+    assets, state = evaluator._assets, evaluator.start()
     reference = lookup(assets.library, jnp.zeros(envs, jnp.int32), jnp.full(envs, 10))
     turn = Rotation.from_euler("z", np.pi / 2)
     pos = turn.apply(np.asarray(reference.body_pos).reshape(-1, 3)).reshape(reference.body_pos.shape)

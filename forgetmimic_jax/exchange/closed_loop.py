@@ -1,0 +1,180 @@
+"""An exported policy at work in plain MuJoCo: one robot, sensors, onnxruntime, PD targets. No JAX in the loop.
+
+What a deploy tool does, written with nothing but numpy and MuJoCo and the ONNX file's own metadata, so that a mistake
+in the export, or in the environment it was trained in, shows. What the robot did is judged afterwards by the tracking
+reward and the terminations of the evaluation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from forgetmimic_jax.config import Config
+from forgetmimic_jax.evaluation.metrics import Rollout
+from forgetmimic_jax.exchange.onnx_actor import OnnxActor
+from forgetmimic_jax.motion.library import MotionLibrary
+from forgetmimic_jax.physics import BodyState
+from forgetmimic_jax.physics.engine import contact_sensor_columns
+from forgetmimic_jax.robot import Robot
+from forgetmimic_jax.tracking import reward
+from forgetmimic_jax.tracking.env import EnvState
+from forgetmimic_jax.tracking.reference import align_to_anchor, lookup
+from forgetmimic_jax.tracking.termination import terminations
+
+DOWN = np.array([0.0, 0.0, -1.0])
+_REFERENCE = ("joint_pos", "body_pos", "body_quat", "body_lin_vel", "body_ang_vel")
+_BODIES = ("pos", "quat", "lin_vel", "ang_vel", "contact_force")
+
+
+@dataclass(frozen=True)
+class Record:
+    """What a policy saw and did in its episodes, one after another."""
+
+    rollout: Rollout
+    observations: np.ndarray  # f32[step, features]
+    actions: np.ndarray  # f32[step, joint]
+
+
+def run_episodes(
+    actor: OnnxActor,
+    robot: Robot,
+    library: MotionLibrary,
+    config: Config,
+    start: EnvState,
+    *,
+    report: Callable[[int, int], None] = lambda episodes, steps: None,
+) -> Record:
+    """Every episode of `start`, from its state to the end of its horizon, falls or not.
+
+    Args:
+        actor: the policy.
+        robot: whose model is stepped.
+        library: the clips to track.
+        config: of the physics, the reward and the bounds that end an episode.
+        start: the episodes (`Evaluator.start`).
+        report: called after each episode with the number of episodes and control steps done.
+    """
+    reference = {name: np.asarray(getattr(library, name), np.float64) for name in _REFERENCE}
+    clips, frames, horizons = (np.asarray(x) for x in (start.clip, start.frame, start.horizon))
+    episodes: list[dict[str, np.ndarray]] = []
+    for clip, frame, horizon, qpos, qvel in zip(
+        clips, frames, horizons, np.asarray(start.physics.qpos), np.asarray(start.physics.qvel), strict=True
+    ):
+        ahead = {name: values[clip, frame + 1 : frame + 1 + horizon] for name, values in reference.items()}
+        episodes.append(_run_episode(actor, robot, ahead, config.physics.substeps, qpos, qvel))
+        report(len(episodes), sum(len(episode["action"]) for episode in episodes))
+    steps = {name: np.concatenate([episode[name] for episode in episodes]) for name in episodes[0]}
+    tracked = np.concatenate([frame + 1 + np.arange(horizon) for frame, horizon in zip(frames, horizons, strict=True)])
+    normalized, broken = _judge(config, robot, library, np.repeat(clips, horizons), tracked, steps)
+
+    rewards = np.zeros((len(clips), horizons.max()), np.float32)
+    lengths = horizons.copy()
+    ends = np.cumsum(horizons)
+    for episode, (begin, end) in enumerate(zip(ends - horizons, ends, strict=True)):
+        rewards[episode, : end - begin] = normalized[begin:end]
+        fallen = np.flatnonzero(broken[begin:end])
+        if fallen.size:  # the step that breaks a bound does not count, but an episode lasts at least one
+            lengths[episode] = max(1, fallen[0])
+    rollout = Rollout(clip=clips, start_frame=frames, horizon=horizons, length=lengths, tracking_reward=rewards)
+    return Record(rollout, steps["observation"], steps["action"])
+
+
+def _run_episode(
+    actor: OnnxActor, robot: Robot, reference: dict[str, np.ndarray], substeps: int, qpos: np.ndarray, qvel: np.ndarray
+) -> dict[str, np.ndarray]:
+    """The states [step, ...] that the policy leads the robot through, and what it saw and did."""
+    model, data = robot.model, mujoco.MjData(robot.model)
+    data.qpos[:], data.qvel[:] = qpos, qvel
+    scale, default = actor.numbers("action_scale"), actor.numbers("default_joint_pos")
+    forces = contact_sensor_columns(robot)
+    action = np.zeros(robot.num_joints, np.float32)
+    steps = []
+    for i in range(len(reference["joint_pos"])):
+        frame = {name: values[i] for name, values in reference.items()}
+        observation = _observe(data, frame, robot.root, default, action)
+        action = actor(observation)
+        data.ctrl[:] = frame["joint_pos"] + scale * action
+        mujoco.mj_step(model, data, substeps)
+        force = -data.sensordata[forces]
+        mujoco.mj_fwdPosition(model, data)  # the bodies, where the last substep left the joints
+        mujoco.mj_fwdVelocity(model, data)
+        velocity = np.zeros((len(robot.key_body_ids), 6))
+        for body, row in zip(robot.key_body_ids, velocity, strict=True):
+            mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, body, row, 0)
+        steps.append(
+            {
+                "observation": observation,
+                "action": action,
+                "qpos": data.qpos.copy(),
+                "qvel": data.qvel.copy(),
+                "pos": data.xpos[robot.key_body_ids],
+                "quat": data.xquat[robot.key_body_ids],
+                "lin_vel": velocity[:, 3:],
+                "ang_vel": velocity[:, :3],
+                "contact_force": force,
+            }
+        )
+    return {name: np.stack([step[name] for step in steps]).astype(np.float32) for name in steps[0]}
+
+
+def _observe(
+    data: mujoco.MjData, reference: dict[str, np.ndarray], root: int, default: np.ndarray, last_action: np.ndarray
+) -> np.ndarray:
+    """The actor's observation f32[features] from the robot's sensors and the frame to reach next."""
+    ref_quat = reference["body_quat"][root]
+    return np.concatenate(
+        [
+            reference["body_pos"][root, 2:],
+            _in_frame(ref_quat, reference["body_lin_vel"][root]),
+            _in_frame(ref_quat, reference["body_ang_vel"][root]),
+            _in_frame(ref_quat, DOWN),
+            reference["joint_pos"],
+            data.qvel[3:6],
+            _in_frame(data.qpos[3:7], DOWN),
+            data.qpos[7:] - default,
+            data.qvel[6:],
+            last_action,
+        ]
+    ).astype(np.float32)
+
+
+def _in_frame(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """A world vector in the frame that `quat` turns into the world."""
+    inverse, result = np.zeros(4), np.zeros(3)
+    mujoco.mju_negQuat(inverse, quat)
+    mujoco.mju_rotVecQuat(result, vector, inverse)
+    return result
+
+
+def _judge(
+    config: Config,
+    robot: Robot,
+    library: MotionLibrary,
+    clip: np.ndarray,
+    frame: np.ndarray,
+    steps: dict[str, np.ndarray],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Normalised tracking reward f[step] and whether a bound is broken bool[step]: steps take the environments' place.
+
+    Args:
+        config: of the reward and the bounds.
+        robot: names and indices.
+        library: the clips tracked.
+        clip: i[step].
+        frame: i[step] the frame that was to be reached.
+        steps: the states reached.
+    """
+    reference = lookup(library, jnp.asarray(clip), jnp.asarray(frame))
+    bodies = BodyState(**{name: jnp.asarray(steps[name]) for name in _BODIES})
+    anchor = robot.anchor
+    aligned = align_to_anchor(reference, anchor, bodies.pos[:, anchor], bodies.quat[:, anchor])
+    joint_pos, joint_vel = jnp.asarray(steps["qpos"][:, 7:]), jnp.asarray(steps["qvel"][:, 6:])
+    errors = reward.tracking_errors(reference, aligned, bodies, anchor, joint_pos, joint_vel)
+    causes = terminations(config.termination, reference, aligned, bodies, anchor, jnp.asarray(robot.end_effectors))
+    normalized = reward.tracking_reward(errors, config.reward)[1]
+    return np.asarray(normalized), np.asarray(jnp.stack(list(causes.values())).any(0))

@@ -1,0 +1,142 @@
+"""Take a policy away as ONNX: `python -m forgetmimic_jax.export --checkpoint runs/...`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from forgetmimic_jax.errors import InputError, run_command
+from forgetmimic_jax.options import at_least, on_engine, parse, replace_given
+
+if TYPE_CHECKING:
+    from forgetmimic_jax.evaluation.metrics import Rollout
+
+
+@dataclass
+class Options:
+    """Write the actor with its normaliser as ONNX, with the metadata deploy tools expect and no motion inside.
+
+    Before the file is written it is run in plain MuJoCo on every clip: its actions must be the policy's to 1e-5, and
+    the robot must move as in the evaluation.
+    """
+
+    robot: str = "g1"
+    """Robot under robots/."""
+    checkpoint: Path | None = None
+    """Checkpoint folder; the shipped base data/ROBOT/base by default."""
+    episodes: int = 2
+    """Episodes a clip in the check: half from frame 0, half spread over the clip."""
+    seed: int = 0
+    """Seed of the check's start frames and reset noise."""
+    library: Path | None = None
+    """Folder of clips for the check; the checkpoint's by default."""
+    output: Path | None = None
+    """File to write; policy.onnx in the checkpoint's run, or runs/export-ROBOT/policy.onnx."""
+
+
+ACTION_TOLERANCE = 1e-5  # of an action, or of 1 where the action is smaller
+EARLY_STEPS, EARLY_TOLERANCE = 10, 1e-4  # so long rounding has not grown, and tracking rewards must be the same
+
+
+def main(options: Options) -> None:
+    """Export, check and write."""
+    import jax
+    import numpy as np
+    from rich.console import Console
+
+    from forgetmimic_jax import checkpoint, runner
+    from forgetmimic_jax.console import closing, progress
+    from forgetmimic_jax.evaluation.rollout import Evaluator
+    from forgetmimic_jax.exchange.closed_loop import run_episodes
+    from forgetmimic_jax.exchange.onnx_actor import OnnxActor, to_onnx
+    from forgetmimic_jax.motion.clip import write_atomically
+    from forgetmimic_jax.state import mean_action
+
+    at_least(1, "--episodes", options.episodes)
+    at_least(0, "--seed", options.seed)
+    path = options.checkpoint or runner.base_folder(options.robot)
+    output = options.output or (runner.folder_of(path) or Path("runs") / f"export-{options.robot}") / "policy.onnx"
+    runner.check_writable(output.parent)
+    if output.is_dir():
+        raise InputError(f"{output}: a folder; --output is a file")
+    info = checkpoint.read_info(path)
+    # The evaluation to reproduce is that of MuJoCo's C engine, which the check runs on too.
+    config = on_engine(replace_given(info.config, robot=options.robot, library=options.library), "native")
+    setup = runner.make_setup(config)
+    checkpoint.check_matches(info, setup.robot, setup.library, setup.library_hash, config, other_library=True)
+    policy = checkpoint.load_policy(path, runner.template(setup))
+
+    run_path = f"{info.robot}/{checkpoint.policy_hash(info)}"
+    content = to_onnx(policy, setup.robot, run_path=run_path, control_step=setup.env.control_step).SerializeToString()
+    evaluator = Evaluator(config, setup.robot, setup.library, episodes=options.episodes, seed=options.seed)
+    start = evaluator.start()
+    with progress("run the ONNX in MuJoCo", len(evaluator.clip)) as report:
+        record = run_episodes(
+            OnnxActor(content),
+            setup.robot,
+            setup.library,
+            evaluator.config,
+            start,
+            report=lambda episodes, steps: report(episodes, steps, {}),
+        )
+    expected = np.asarray(jax.jit(mean_action, static_argnums=1)(policy, config, record.observations))
+    error = float((np.abs(record.actions - expected) / np.maximum(1.0, np.abs(expected))).max())
+    if not error <= ACTION_TOLERANCE:
+        raise InputError(f"{path}: the ONNX's actions differ from the policy's by {error:.1e}; nothing was written")
+    evaluation = evaluator.rollout(policy)
+    early = early_difference(evaluation, record.rollout)
+    if not early <= EARLY_TOLERANCE:
+        raise InputError(
+            f"{path}: in MuJoCo the ONNX's tracking reward differs from the evaluation's by {early:.1e} within "
+            f"{EARLY_STEPS} steps; nothing was written"
+        )
+    output.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(output, content)
+    console = Console()
+    console.print(_table(setup.library.names, evaluation, record.rollout))
+    console.print(
+        f"{len(record.actions):,} actions equal the policy's to {error:.0e}; over the first {EARLY_STEPS} steps "
+        f"tracking equals the evaluation's to {early:.0e}; later, rounding may grow at contacts.",
+        highlight=False,
+    )
+    closing({"policy": output}, f"make evaluate ROBOT={options.robot} CHECKPOINT={path} EPISODES=100")
+
+
+def early_difference(one: Rollout, other: Rollout) -> float:
+    """Largest difference of tracking reward over the first steps that both policies survive."""
+    import numpy as np
+
+    from forgetmimic_jax.evaluation.metrics import common_length, steps_before
+
+    steps = min(EARLY_STEPS, one.tracking_reward.shape[1])
+    alive = steps_before(common_length([one, other]), steps)
+    difference = np.abs(one.tracking_reward[:, :steps] - other.tracking_reward[:, :steps])
+    return float(difference[alive].max())
+
+
+def _table(names: Sequence[str], evaluation: Rollout, onnx: Rollout):
+    """Success and tracking of every clip in the evaluation and with the ONNX."""
+    from rich import box
+    from rich.table import Table
+
+    from forgetmimic_jax.evaluation.metrics import episode_metrics
+
+    table = Table(title="Evaluation → ONNX in plain MuJoCo", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    for column in ("clip", "success", "tracking", "steps"):
+        table.add_column(column, justify="left" if column == "clip" else "right")
+    ours, theirs = episode_metrics(evaluation), episode_metrics(onnx)
+    shown = {"success_rate": ".0%", "survival_weighted_tracking": ".3f", "episode_length": ".0f"}
+    for row, members in [
+        *((name, evaluation.clip == i) for i, name in enumerate(names)),
+        ("all", evaluation.clip >= 0),
+    ]:
+        table.add_row(
+            row, *(f"{ours[m][members].mean():{f}} → {theirs[m][members].mean():{f}}" for m, f in shown.items())
+        )
+    return table
+
+
+if __name__ == "__main__":
+    run_command(lambda: main(parse(Options, "export")))

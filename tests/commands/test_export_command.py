@@ -1,0 +1,84 @@
+import shutil
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from miniature import finished
+
+from forgetmimic_jax import export
+from forgetmimic_jax.checkpoint import policy_hash, read_info
+from forgetmimic_jax.exchange import onnx_actor
+
+
+@pytest.fixture
+def options(base_run):
+    """Options that export the base into the working folder."""
+
+    def options(**given) -> export.Options:
+        return export.Options(**{"checkpoint": base_run.checkpoint(4), "output": Path("policy.onnx")} | given)
+
+    return options
+
+
+def test_it_checks_writes_and_tells(unlearned_run, tmp_path):
+    run = Path(shutil.copytree(unlearned_run.folder, tmp_path / "run"))
+    path = run / "checkpoints" / "00000002"
+    default = finished(export.main, export.Options(checkpoint=path, output=None))
+    file = run / "policy.onnx"
+    told = {entry.key: entry.value for entry in onnx.load(file).metadata_props}
+    assert told["run_path"] == f"g1/{policy_hash(read_info(path))}"
+    assert not any(clip in file.read_bytes() for clip in (b"sway", b"turn", b"nod"))
+    assert {each.name for each in run.iterdir()} - {each.name for each in unlearned_run.folder.iterdir()} == {
+        "policy.onnx"
+    }
+    printed = default.printed
+    assert "Evaluation → ONNX in plain MuJoCo" in printed
+    assert " sway " in printed
+    assert f"policy  {file}" in printed
+    assert printed.splitlines()[-1] == f"Next: make evaluate ROBOT=g1 CHECKPOINT={path} EPISODES=100"
+
+
+def test_an_onnx_that_leads_the_robot_elsewhere_is_refused(options, monkeypatch, capfd, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    metadata = onnx_actor.metadata
+
+    def wrong(robot, **known):
+        scales = metadata(robot, **known)["action_scale"].split(",")
+        return metadata(robot, **known) | {"action_scale": ",".join(["1.0", *scales[1:]])}
+
+    monkeypatch.setattr(onnx_actor, "metadata", wrong)
+    with pytest.raises(SystemExit):
+        export.run_command(lambda: export.main(options()))
+    assert "in MuJoCo the ONNX's tracking reward differs from the evaluation's by " in capfd.readouterr().err
+    assert not any(tmp_path.iterdir())
+
+
+def test_an_onnx_with_other_actions_is_refused(options, monkeypatch, capfd, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    layers = onnx_actor.dense_layers
+    monkeypatch.setattr(
+        onnx_actor,
+        "dense_layers",
+        lambda policy: [(kernel + np.float32(1e-3), bias) for kernel, bias in layers(policy)],
+    )
+    with pytest.raises(SystemExit):
+        export.run_command(lambda: export.main(options()))
+    assert "the ONNX's actions differ from the policy's by " in capfd.readouterr().err
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"robot": "gg1", "checkpoint": None}, "robot 'gg1': no robots/gg1/gg1.yaml; did you mean 'g1'?"),
+        ({"checkpoint": Path("nowhere")}, "nowhere: no such checkpoint folder"),
+        ({"episodes": 0}, "--episodes: found 0; accepted: 1 or more"),
+        ({"seed": -1}, "--seed: found -1; accepted: 0 or more"),
+        ({"library": Path("nowhere")}, "nowhere/manifest.json: not found; a library is a folder with manifest.json"),
+        ({"output": Path(__file__).parent}, f"{Path(__file__).parent}: a folder; --output is a file"),
+        ({"output": Path(__file__) / "x.onnx"}, f"{__file__}: {__file__} is a file; choose another --output"),
+    ],
+)
+def test_what_cannot_be_is_told_in_one_line(refused, options, given, told):
+    assert refused(export.main, options(**given)) == told

@@ -1,0 +1,79 @@
+import numpy as np
+import onnx
+import pytest
+
+from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.exchange.onnx_actor import OnnxActor, to_onnx
+from forgetmimic_jax.state import mean_action
+
+
+@pytest.fixture(scope="module")
+def model(policy, robot) -> onnx.ModelProto:
+    return to_onnx(policy, robot, run_path="g1/0123456789abcdef", control_step=0.02)
+
+
+@pytest.fixture(scope="module")
+def actor(model) -> OnnxActor:
+    return OnnxActor(model.SerializeToString())
+
+
+def test_its_actions_are_the_policys(actor, policy, tiny_config):
+    observations = np.random.default_rng(0).normal(0.0, 3.0, (50, 132)).astype(np.float32)
+    observations[:5] *= 100.0  # beyond what the normaliser lets through
+    expected = np.asarray(mean_action(policy, tiny_config, observations))
+    found = np.stack([actor(observation) for observation in observations])
+    assert np.abs(expected).max() > 1.0
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
+
+
+def test_one_observation_goes_in_and_one_action_comes_out(model):
+    (given,), (result,) = model.graph.input, model.graph.output
+    for value, name, size in ((given, "obs", 132), (result, "actions", 29)):
+        assert value.name == name
+        assert [dimension.dim_value for dimension in value.type.tensor_type.shape.dim] == [1, size]
+
+
+def test_it_holds_the_network_and_nothing_of_a_motion(model):
+    shapes = {tensor.name: list(tensor.dims) for tensor in model.graph.initializer}
+    assert shapes == {
+        **{"mean": [132], "scale": [132], "low": [], "high": []},
+        **{"kernel_0": [132, 16], "kernel_1": [16, 16], "kernel_2": [16, 29]},
+        **{"bias_0": [16], "bias_1": [16], "bias_2": [29]},
+    }
+    assert not any(node.op_type == "Constant" for node in model.graph.node)
+
+
+def test_the_metadata_is_mjlabs(actor, robot):
+    assert set(actor.metadata) == {
+        *("run_path", "joint_names", "joint_stiffness", "joint_damping", "default_joint_pos", "command_names"),
+        *("observation_names", "action_scale", "anchor_body_name", "body_names"),  # mjlab's tracking tasks
+        *("policy_only_export", "action_mode"),  # wbc-mjlab's
+        "step_dt",
+    }
+    told = actor.metadata
+    assert told["joint_names"].split(",") == list(robot.joint_names)
+    assert told["body_names"].split(",")[0] == "pelvis"
+    assert (told["anchor_body_name"], told["command_names"]) == ("torso_link", "motion")
+    assert told["observation_names"] == (
+        "ref_base_height,ref_base_lin_vel_b,ref_base_ang_vel_b,ref_gravity_b,ref_joint_pos,"
+        "base_ang_vel,projected_gravity,joint_pos,joint_vel,actions"
+    )
+    assert told["action_mode"] == "reference_residual"
+
+
+def test_gains_and_scales_read_back_to_the_last_digit(actor, robot):
+    model = robot.model
+    np.testing.assert_allclose(actor.numbers("joint_stiffness"), model.actuator_gainprm[:, 0], rtol=1e-6)
+    np.testing.assert_allclose(actor.numbers("joint_damping"), -model.actuator_biasprm[:, 2], rtol=1e-6)
+    effort = model.actuator_forcerange[:, 1]
+    np.testing.assert_allclose(actor.numbers("action_scale"), 0.25 * effort / model.actuator_gainprm[:, 0], rtol=1e-6)
+    for key in ("action_scale", "default_joint_pos"):
+        arrays = np.asarray(getattr(robot.arrays, {"default_joint_pos": key}.get(key, key)))
+        np.testing.assert_array_equal(actor.numbers(key).astype(np.float32), arrays)
+
+
+def test_a_file_that_is_no_model_is_told(tmp_path):
+    path = tmp_path / "policy.onnx"
+    path.write_bytes(b"not a model")
+    with pytest.raises(InputError, match=f"^{path}: not a readable ONNX model: "):
+        OnnxActor(path)
