@@ -21,6 +21,7 @@ from forgetmimic_jax.errors import InputError, nearest
 
 ROBOTS_DIR = Path(__file__).resolve().parent.parent / "robots"
 CONTACT_SENSOR = "contact_"
+VISUAL_GROUP = 2  # the geom group of the shapes that are only seen
 
 
 @struct.dataclass
@@ -106,9 +107,8 @@ def load_robot(
     """
     path = roles_file(name, robots_dir)
     roles = _read_roles(path)
-    if not (path.parent / roles["model"]).is_file():
-        raise InputError(f"{path}: model: no file '{roles['model']}'")
-    spec = mujoco.MjSpec.from_file(str(path.parent / roles["model"]))
+    spec = read_spec(name, robots_dir)
+    spec.compiler.discardvisual = True  # shapes that are only seen would cost every step a little
     spec.option.timestep = timestep
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.iterations = solver_iterations
@@ -205,6 +205,19 @@ def load_robot(
         ),
         arrays=arrays,
     )
+
+
+def read_spec(name: str, robots_dir: Path = ROBOTS_DIR) -> mujoco.MjSpec:
+    """A robot's MJCF as it is in its folder, with the shapes that are only seen.
+
+    Raises:
+        InputError: unknown robot, or no such file.
+    """
+    path = roles_file(name, robots_dir)
+    file = path.parent / _read_roles(path)["model"]
+    if not file.is_file():
+        raise InputError(f"{path}: model: no file '{file.name}'")
+    return mujoco.MjSpec.from_file(str(file))
 
 
 def _read_roles(path: Path) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from forgetmimic_jax.errors import InputError
-from forgetmimic_jax.robot import CONTACT_SENSOR, ROBOTS_DIR, load_robot, robot_names
+from forgetmimic_jax.robot import CONTACT_SENSOR, ROBOTS_DIR, VISUAL_GROUP, load_robot, read_spec, robot_names
 
 REFERENCE = Path(__file__).resolve().parents[2] / "shared/data/robots/g1_reference.xml"
 
@@ -142,6 +142,21 @@ def test_whole_body_inertia_is_the_composite_one(g1):
     com = data.subtree_com[1]
     shift = float(g1.arrays.mass) * (com @ com * np.eye(3) - np.outer(com, com))
     np.testing.assert_allclose(g1.arrays.inertia, mass_matrix[3:6, 3:6] - shift, rtol=1e-4, atol=1e-4)
+
+
+def test_shapes_to_be_seen_weigh_nothing_touch_nothing_and_are_not_simulated(g1):
+    drawn = read_spec("g1").compile()
+    seen = drawn.geom_group == VISUAL_GROUP
+    assert seen.sum() > 50
+    assert not drawn.geom_contype[seen].any()
+    assert not drawn.geom_conaffinity[seen].any()
+    assert g1.model.ngeom == (~seen).sum()
+    assert VISUAL_GROUP not in g1.model.geom_group
+    for field in ("body_mass", "body_inertia", "body_ipos", "body_iquat"):
+        np.testing.assert_array_equal(getattr(drawn, field), getattr(g1.model, field), err_msg=field)
+    for side in ("left", "right"):
+        bodies = [drawn.body(body).name for body in drawn.geom_bodyid[seen]]
+        assert sum(body.startswith(side) for body in bodies) > 20
 
 
 def test_only_the_floor_is_touched_unless_self_collision_is_asked_for(g1):

@@ -79,21 +79,14 @@ class Evaluator:
         )
 
     def _begin_episodes(self, assets: Assets, key: Array) -> EnvState:
-        n = self._env.num_envs
-        clip, frame = jnp.asarray(self.clip, jnp.int32), jnp.asarray(self.start_frame, jnp.int32)
-        zeros = jnp.zeros((n,), jnp.int32)
-        state = tracking.start_episodes(self._env, assets, key, clip, zeros, frame, zeros.astype(jnp.float32))
-        return tracking.refresh_bodies(self._env, state, jnp.ones((n,), bool))
+        state = begin_episodes(self._env, assets, key, jnp.asarray(self.clip), jnp.asarray(self.start_frame))
+        return tracking.refresh_bodies(self._env, state, jnp.ones((self._env.num_envs,), bool))
 
     def _advance_chunk(self, assets: Assets, policy: Policy | None, state: EnvState):
         env = self._env
 
         def one_step(state: EnvState, key: Array):
-            if policy is None:
-                action = jnp.zeros((env.num_envs, env.robot.num_joints), jnp.float32)
-            else:
-                observation = tracking.observe(env, assets, state, None)[0]
-                action = mean_action(policy, env.config, observation)
+            action = act(env, policy, tracking.observe(env, assets, state, None)[0])
             state, result = tracking.step(env, assets, state, action, key)
             record = step_errors(env, assets, state, result)
             record |= {
@@ -104,6 +97,20 @@ class Evaluator:
             return state, record
 
         return jax.lax.scan(one_step, state, jax.random.split(jax.random.PRNGKey(0), CHUNK))
+
+
+def begin_episodes(env: Environment, assets: Assets, key: Array, clip: Array, frame: Array) -> EnvState:
+    """Episodes [env] at given clips and frames, with reset noise, without the wrench. Bodies: the reference's."""
+    zeros = jnp.zeros((env.num_envs,), jnp.int32)
+    clip, frame = clip.astype(jnp.int32), frame.astype(jnp.int32)
+    return tracking.start_episodes(env, assets, key, clip, zeros, frame, zeros.astype(jnp.float32))
+
+
+def act(env: Environment, policy: Policy | None, observation: Array) -> Array:
+    """The mean action [env, joint] for the actor's observation [env, features]; zero without a policy."""
+    if policy is None:
+        return jnp.zeros((observation.shape[0], env.robot.num_joints), jnp.float32)
+    return mean_action(policy, env.config, observation)
 
 
 def evaluation_config(config: Config) -> Config:

@@ -1,0 +1,166 @@
+"""Films of episodes: the policies' panes side by side with captions burnt in, as MP4, GIF and a contact sheet."""
+
+from __future__ import annotations
+
+import functools
+import io
+from collections.abc import Iterable, Iterator, Sequence
+
+import av
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation
+
+from forgetmimic_jax.viewing.offscreen import Renderer
+from forgetmimic_jax.viewing.side_by_side import Episode, Take
+
+FPS = 25.0  # of a film
+PANE = (400, 400)  # width and height of one policy's pane, pixels
+HEADER = 36  # pixels above the panes
+FRONT_LEFT = 215.0  # degrees from the robot's heading at the start to the camera's gaze
+SMOOTH_SECONDS = 0.25  # width of the Gaussian that smooths the camera's path
+LEAN = 0.5  # m, how far the camera looks from the robot towards the reference
+INK, PAPER, GREY = (28, 32, 38), (255, 255, 255), (110, 118, 128)
+RED, TARGET = (208, 32, 42), (176, 84, 0)
+BORDER = 5  # pixels of the red frame after the end
+
+
+def pane_renderer(robot: str) -> Renderer:
+    """The renderer that `render_clip` draws its panes with."""
+    return Renderer(robot, *PANE)
+
+
+def render_clip(
+    renderer: Renderer, episode: Episode, *, target: bool = False, fps: float = FPS
+) -> Iterator[np.ndarray]:
+    """The film of an episode, frame by frame.
+
+    Args:
+        renderer: from `pane_renderer`.
+        episode: what `record` returned for one clip.
+        target: the clip is one to be forgotten, and the header says so.
+        fps: pictures a second; the episode's steps are thinned to it.
+
+    Yields:
+        [height, width, 3] u8: a header, and below it one pane a policy.
+    """
+    shown = range(0, len(episode.reference), max(1, round(episode.fps / fps)))
+    paths = {name: _camera_path(take.qpos, episode.reference, episode.fps) for name, take in episode.takes.items()}
+    azimuth = _heading_degrees(episode.reference[0]) + FRONT_LEFT
+    for step in shown:
+        panes = [
+            _pane(renderer, name, take, episode, step, paths[name][step], azimuth)
+            for name, take in episode.takes.items()
+        ]
+        frame = Image.new("RGB", (PANE[0] * len(panes), PANE[1] + HEADER), PAPER)
+        _header(frame, episode, target, step)
+        for column, pane in enumerate(panes):
+            frame.paste(pane, (column * PANE[0], HEADER))
+        yield np.asarray(frame)
+
+
+def contact_sheet(rows: Sequence[tuple[Episode, Sequence[np.ndarray]]], *, pictures: int = 6) -> Image.Image:
+    """All clips on one page: a row a clip, `pictures` of its frames evenly spread.
+
+    Args:
+        rows: episode and its film's frames.
+        pictures: a row.
+    """
+    width = max(frames[0].shape[1] for _, frames in rows) // 2
+    height = rows[0][1][0].shape[0] // 2
+    sheet = Image.new("RGB", (width * pictures, height * len(rows)), PAPER)
+    for row, (_, frames) in enumerate(rows):
+        for column, index in enumerate(np.linspace(0, len(frames) - 1, pictures).round().astype(int)):
+            small = Image.fromarray(frames[index]).reduce(2)
+            sheet.paste(small, (column * width, row * height))
+    return sheet
+
+
+def mp4(frames: Iterable[np.ndarray], fps: float = FPS) -> bytes:
+    """Frames [height, width, 3] u8 as an H.264 film in an MP4 container."""
+    buffer = io.BytesIO()
+    with av.open(buffer, "w", format="mp4") as container:
+        stream = None
+        for frame in frames:
+            if stream is None:
+                stream = container.add_stream("libx264", rate=round(fps), options={"crf": "23", "preset": "medium"})
+                stream.height, stream.width = frame.shape[:2]
+                stream.pix_fmt = "yuv420p"
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        if stream is not None:
+            container.mux(stream.encode(None))
+    return buffer.getvalue()
+
+
+def gif(frames: Sequence[np.ndarray], fps: float = FPS, *, thin: int = 2, shrink: int = 2) -> bytes:
+    """Every `thin`-th frame, `shrink` times smaller, as an endless GIF."""
+    images = [Image.fromarray(frame).reduce(shrink) for frame in frames[::thin]]
+    # One palette for all: the colours of a picture early, one in the middle and one late.
+    probe = np.concatenate([np.asarray(images[i]) for i in (0, len(images) // 2, -1)])
+    palette = Image.fromarray(probe).quantize(128)
+    indexed = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    buffer = io.BytesIO()
+    indexed[0].save(
+        buffer, format="GIF", save_all=True, append_images=indexed[1:], duration=round(1000 * thin / fps), loop=0
+    )
+    return buffer.getvalue()
+
+
+def _pane(
+    renderer: Renderer, name: str, take: Take, episode: Episode, step: int, look_at: np.ndarray, azimuth: float
+) -> Image.Image:
+    image = Image.fromarray(renderer.picture(take.qpos[step], episode.reference[step], look_at, azimuth))
+    pen = ImageDraw.Draw(image, "RGBA")
+    width, height = PANE
+    _chip(pen, (10, 10), name.replace("_", " "), INK)
+    ended = take.ended if take.ended is not None and step >= take.ended else None
+    rewards = take.tracking_reward
+    reward = 0.0 if ended is not None else float(rewards[min(step, len(rewards) - 1)])
+    text = f"tracking {reward:.2f}"
+    pen.rectangle([10, height - 20, width - 10, height - 12], fill=(255, 255, 255, 170))
+    pen.rectangle([10, height - 20, 10 + (width - 20) * reward, height - 12], fill=(46, 140, 90, 255))
+    pen.text((10, height - 26), text, font=_font(15), fill=INK, anchor="ls")
+    if ended is not None:
+        pen.rectangle([0, 0, width - 1, height - 1], outline=RED, width=BORDER)
+        _chip(pen, (width - 10, 10), f"fell at {ended / episode.fps:.2f} s", RED, right=True)
+    return image
+
+
+def _header(frame: Image.Image, episode: Episode, target: bool, step: int) -> None:
+    pen = ImageDraw.Draw(frame)
+    middle = HEADER // 2
+    pen.text((10, middle), episode.clip, font=_font(19), fill=INK, anchor="lm")
+    if target:
+        left = 10 + pen.textlength(episode.clip, font=_font(19)) + 12
+        pen.text((left, middle), "to be forgotten", font=_font(16), fill=TARGET, anchor="lm")
+    time = f"{step / episode.fps:.2f} s"
+    pen.text((frame.width - 10, middle), time, font=_font(16), fill=GREY, anchor="rm")
+
+
+def _chip(pen: ImageDraw.ImageDraw, corner: tuple[int, int], text: str, colour: tuple[int, ...], right=False) -> None:
+    """White text on a rounded patch whose upper left, or with `right` upper right, corner is given."""
+    font = _font(15)
+    width = pen.textlength(text, font=font) + 16
+    left = corner[0] - width if right else corner[0]
+    pen.rounded_rectangle([left, corner[1], left + width, corner[1] + 25], radius=6, fill=(*colour, 225))
+    pen.text((left + 8, corner[1] + 12), text, font=font, fill=PAPER, anchor="lm")
+
+
+@functools.cache
+def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    return ImageFont.load_default(size)
+
+
+def _camera_path(qpos: np.ndarray, reference: np.ndarray, fps: float) -> np.ndarray:
+    """Where to look, [step, 2] m: between robot and reference but near the robot, and smooth, whatever it does."""
+    apart = 0.5 * (reference[:, :2] - qpos[:, :2])
+    distance = np.linalg.norm(apart, axis=1, keepdims=True)
+    towards = apart * np.minimum(1.0, LEAN / np.maximum(distance, 1e-9))
+    return gaussian_filter1d(qpos[:, :2] + towards, SMOOTH_SECONDS * fps, axis=0, mode="nearest")
+
+
+def _heading_degrees(qpos: np.ndarray) -> float:
+    """Yaw of the root's x axis over the floor."""
+    forward = Rotation.from_quat(qpos[3:7], scalar_first=True).apply([1.0, 0.0, 0.0])
+    return float(np.degrees(np.arctan2(forward[1], forward[0])))

@@ -1,0 +1,29 @@
+import jax
+import pytest
+
+from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.state import Policy, init_policy
+from forgetmimic_jax.tracking.observation import actor_size
+from forgetmimic_jax.viewing import offscreen
+from forgetmimic_jax.viewing.side_by_side import Episode, record
+
+
+@pytest.fixture(scope="session")
+def policy(robot, tiny_config) -> Policy:
+    return init_policy(tiny_config, robot.num_joints, actor_size(robot.num_joints), 623, jax.random.PRNGKey(0))
+
+
+@pytest.fixture(scope="session")
+def episodes(robot, library, tiny_config, policy) -> list[Episode]:
+    """`turn`, then `sway`, by the zero action and by a random policy."""
+    policies = {"zero_action": None, "random": policy}
+    return record(tiny_config, robot, library, policies, ["turn", "sway"], seed=3)
+
+
+@pytest.fixture(scope="session")
+def rendering() -> None:
+    """Skips where nothing can be drawn without a screen."""
+    try:
+        offscreen.check_rendering()
+    except InputError as error:
+        pytest.skip(str(error))

@@ -1,0 +1,59 @@
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from forgetmimic_jax.evaluation.metrics import episode_metrics
+from forgetmimic_jax.evaluation.rollout import Evaluator
+from forgetmimic_jax.viewing.side_by_side import SideBySide, Take, push, reference_qpos
+
+
+def test_what_is_shown_is_what_the_evaluation_measures(robot, library, tiny_config, policy, episodes):
+    evaluator = Evaluator(tiny_config, robot, library, episodes=1, seed=3)
+    order = [library.names.index(episode.clip) for episode in episodes]
+    assert order == [1, 0]
+    # The reset noise is drawn for the starts as they are ordered; so the evaluation gets the recorded order.
+    evaluator.clip = evaluator.clip[order]
+    for name, networks in (("zero_action", None), ("random", policy)):
+        rollout = evaluator.rollout(networks)
+        tracking = episode_metrics(rollout)["survival_weighted_tracking"]
+        for row, episode in enumerate(episodes):
+            take = episode.takes[name]
+            assert len(take.tracking_reward) == rollout.horizon[row]
+            assert (take.ended or rollout.horizon[row]) == rollout.length[row]
+            assert take.survival_weighted_tracking == pytest.approx(tracking[row], abs=1e-6)
+
+
+def test_every_policy_starts_from_the_same_configuration_and_then_goes_its_own_way(episodes):
+    for episode in episodes:
+        zero, random = episode.takes.values()
+        np.testing.assert_array_equal(zero.qpos[0], random.qpos[0])
+        assert np.abs(zero.qpos[1] - random.qpos[1]).max() > 1e-5
+        assert len(zero.qpos) == len(episode.reference) == len(zero.tracking_reward) + 1
+
+
+def test_the_reference_is_the_clip_itself(robot, library):
+    qpos = reference_qpos(robot, library, 1)
+    assert qpos.shape == (41, 7 + robot.num_joints)
+    # `turn` walks at 0.2 m/s and turns by 1 rad/s, from the default pose's height.
+    assert np.linalg.norm(qpos[1, :2] - qpos[0, :2]) == pytest.approx(0.2 / 50.0, rel=1e-3)
+    yaw = 2.0 * np.arctan2(qpos[40, 6], qpos[40, 3])
+    assert yaw == pytest.approx(0.8, abs=1e-2)
+
+
+def test_zeros_count_after_the_end():
+    take = Take(qpos=np.zeros((5, 36)), tracking_reward=np.array([0.8, 0.6, 0.9, 0.9]), ended=2)
+    assert take.survival_weighted_tracking == pytest.approx(1.4 / 4)
+    assert dataclasses.replace(take, ended=None).survival_weighted_tracking == pytest.approx(3.2 / 4)
+
+
+def test_a_push_changes_the_roots_velocity_alone(robot, library, tiny_config):
+    stage = SideBySide(tiny_config, robot, library, {"zero_action": None})
+    state = stage.begin([0], [5])
+    pushed = push(state, [1.0, -2.0, 0.5])
+    change = np.asarray(pushed.physics.qvel - state.physics.qvel)
+    np.testing.assert_allclose(change[0, :3], [1.0, -2.0, 0.5], atol=1e-6)
+    assert not change[0, 3:].any()
+    for old, new in zip(jax.tree.leaves(state), jax.tree.leaves(push(state, np.zeros(3))), strict=True):
+        np.testing.assert_array_equal(old, new)
