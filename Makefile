@@ -5,6 +5,7 @@
 ## ROBOT        a folder under robots/ (default: g1)
 ## TARGETS      clips to forget, comma-separated: punch,kick
 ## LAMBDA       penalty on the targets' tracking reward (default: 16)
+## METHOD       how to forget; `make unlearn ARGS=--help` names them (default: arft)
 ## PRESET       cpu or paper (default: cpu)
 ## PHYSICS      auto, native, mjx or mjx-warp (default: auto)
 ## LIBRARY      folder of clips (default: data/ROBOT)
@@ -40,7 +41,7 @@ help: ## this list
 	@sed -n 's/^## /  /p' Makefile
 
 unlearn: .venv/.installed ## forget TARGETS, then evaluate base and unlearned policy side by side
-	$(MODULE).unlearn $(strip $(TRAIN_FLAGS) $(TARGET_FLAGS) $(call flag,penalty,LAMBDA) $(ARGS))
+	$(MODULE).unlearn $(strip $(TRAIN_FLAGS) $(TARGET_FLAGS) $(call flag,penalty,LAMBDA) $(call flag,method,METHOD) $(ARGS))
 
 pretrain: .venv/.installed ## train a base policy on every clip
 	$(MODULE).train $(strip $(TRAIN_FLAGS) $(ARGS))

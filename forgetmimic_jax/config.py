@@ -108,6 +108,7 @@ class SamplingConfig:
     uniform_ratio: float = 0.15  # ρ
     initial_failure: float = 1.0
     failure_signal: Literal["survival_weighted", "alive_mean"] = "survival_weighted"
+    clips: Literal["all", "kept"] = "all"  # kept: no episode of a clip to forget
 
 
 @dataclass(frozen=True)
@@ -150,10 +151,11 @@ class PPOConfig:
 
 @dataclass(frozen=True)
 class UnlearnConfig:
-    """The unlearning flag: clips to forget and the penalty λ. No targets: ordinary training."""
+    """The unlearning flag: clips to forget, how, and the penalty λ. No targets: ordinary training."""
 
     targets: tuple[str, ...] = ()
-    penalty: float = 16.0  # λ; W = 8 is the edge of the paper's algebra
+    penalty: float = 16.0  # λ of arft; W = 8 is the edge of the paper's algebra
+    method: str = "arft"  # a module of forgetmimic_jax.unlearning
 
 
 @dataclass(frozen=True)

@@ -39,6 +39,7 @@ def main(options: Options) -> None:
     from forgetmimic_jax import checkpoint, runner
     from forgetmimic_jax.console import closing
     from forgetmimic_jax.evaluation.evaluate import cost, evaluate, show_and_write
+    from forgetmimic_jax.unlearning.registry import method_of
 
     at_least(1, "--episodes", options.episodes)
     at_least(0, "--seed", options.seed)
@@ -52,10 +53,11 @@ def main(options: Options) -> None:
     targets = info.config.unlearn.targets if options.targets is None else comma_separated(options.targets)
     runner.check_targets(targets, setup.library.names)
     shapes = runner.template(setup)
-    name = "unlearned" if info.config.unlearn.targets else "base"
+    unlearned = bool(info.config.unlearn.targets)
+    name: str = method_of(info.config).result if unlearned else "base"
     policies = {name: checkpoint.load_policy(path, shapes)}
     budget = {name: cost(info)}
-    if name == "unlearned":
+    if unlearned:
         base = options.base or runner.base_checkpoint(info.config)
         base_info = checkpoint.read_info(base)
         checkpoint.check_matches(base_info, setup.robot, setup.library, setup.library_hash, config)

@@ -10,11 +10,11 @@ from typing import Annotated, Any, Literal, TypeVar
 import tyro
 import yaml
 
-from forgetmimic_jax.config import Config, PhysicsConfig, from_dict, to_dict
+from forgetmimic_jax.config import Config, PhysicsConfig, SamplingConfig, from_dict, to_dict
 from forgetmimic_jax.errors import InputError, nearest
 
 T = TypeVar("T")
-C = TypeVar("C", Config, PhysicsConfig)
+C = TypeVar("C", Config, PhysicsConfig, SamplingConfig)
 
 # One list for each time that --set is given: what a later one names does not replace an earlier one.
 Settings = Annotated[list[list[str]], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="SECTION.NAME=VALUE")]

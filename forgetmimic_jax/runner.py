@@ -31,8 +31,9 @@ from forgetmimic_jax.motion.library import DATA_DIR, MotionLibrary, library_hash
 from forgetmimic_jax.ppo.update import make_iteration
 from forgetmimic_jax.robot import Robot, load_robot, roles_file
 from forgetmimic_jax.rows import drop_rows_after
-from forgetmimic_jax.state import TrainState, init_state
+from forgetmimic_jax.state import Policy, TrainState, init_state
 from forgetmimic_jax.tracking.env import Assets, Environment, make_assets, make_environment
+from forgetmimic_jax.unlearning.registry import method_of
 
 COMPILATION_CACHE = DATA_DIR.parent / ".cache" / "jax"  # what XLA compiled is not compiled again at the next start
 BEST = "best"
@@ -67,6 +68,7 @@ def make_setup(config: Config) -> Setup:
     folder = library_folder(config)
     library = load_library(robot, folder, fps=1.0 / (config.physics.timestep * config.physics.substeps))
     check_targets(config.unlearn.targets, library.names)
+    method_of(config)
     env = make_environment(config, robot, config.ppo.num_envs)
     return Setup(config, robot, library, library_hash(folder), env, make_assets(config, robot, library))
 
@@ -77,24 +79,39 @@ def template(setup: Setup) -> TrainState:
 
 
 def start_state(setup: Setup) -> TrainState:
-    """A fresh run's state; with a base, a warm start from its policy.
+    """A fresh run's state; with a base, a warm start from its policy, unless the unlearning method trains a fresh one.
 
-    Training may go on with other clips than the base's; unlearning needs the base's own.
+    Where unlearning samples or assists by failure levels, it goes on with the base's.
     """
-    key = jax.random.PRNGKey(setup.config.seed)
-    unlearning = bool(setup.config.unlearn.targets)
-    if setup.config.base is None and not unlearning:
+    config, unlearning = setup.config, bool(setup.config.unlearn.targets)
+    key = jax.random.PRNGKey(config.seed)
+    if method_of(config).start == "fresh" or (config.base is None and not unlearning):
         return jax.jit(lambda assets, key: init_state(setup.env, assets, key))(setup.assets, key)
-    base = base_checkpoint(setup.config)
-    info = checkpoint.read_info(base)
-    checkpoint.check_matches(
-        info, setup.robot, setup.library, setup.library_hash, setup.config, other_library=not unlearning
-    )
-    shapes = template(setup)
-    policy = checkpoint.load_policy(base, shapes)
-    failure_level = checkpoint.load_failure_level(base, shapes) if setup.config.sampling.rule == "frozen" else None
+    policy, failure_level = base_policy(setup), None
+    by_failure = config.sampling.rule == "adaptive" or config.wrench.max_gain > 0
+    if config.sampling.rule == "frozen" or (unlearning and by_failure):
+        failure_level = checkpoint.load_failure_level(base_checkpoint(config), template(setup))
     start = jax.jit(lambda assets, key, policy, level: init_state(setup.env, assets, key, policy, level))
     return start(setup.assets, key, policy, failure_level)
+
+
+def base_policy(setup: Setup) -> Policy:
+    """The policy that a run starts from.
+
+    Training may go on with other clips than the base's; unlearning needs the base's own.
+
+    Raises:
+        InputError: the checkpoint is not of this robot, network or library.
+    """
+    base, training = base_checkpoint(setup.config), not setup.config.unlearn.targets
+    info = checkpoint.read_info(base)
+    checkpoint.check_matches(info, setup.robot, setup.library, setup.library_hash, setup.config, other_library=training)
+    return checkpoint.load_policy(base, template(setup))
+
+
+def with_base(setup: Setup) -> Setup:
+    """The setup of an unlearning run, whose method may hold the policy against the frozen base."""
+    return dataclasses.replace(setup, assets=dataclasses.replace(setup.assets, base=base_policy(setup)))
 
 
 def check_targets(targets: tuple[str, ...], names: tuple[str, ...]) -> None:

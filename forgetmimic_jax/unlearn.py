@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from forgetmimic_jax.config import Config, UnlearnConfig, load_config, preset
+from forgetmimic_jax.config import Config, UnlearnConfig, WrenchConfig, load_config, preset
 from forgetmimic_jax.errors import InputError, run_command
 from forgetmimic_jax.options import (
     Settings,
@@ -24,7 +24,7 @@ from forgetmimic_jax.options import (
 
 @dataclass
 class Options:
-    """Fine-tune a base policy with the anti-reward on the target clips, then evaluate before and after.
+    """Make a base policy forget the target clips, by default with the anti-reward, then evaluate before and after.
 
     Uniform sampling, no assistive wrench, Adam reset (the paper's ForgetMimic). Stop with Ctrl-C, go on with --resume.
     """
@@ -33,12 +33,21 @@ class Options:
     """Robot under robots/."""
     targets: str | None = None
     """Clips to forget, comma-separated; the library's default targets (g1: punch,kick) by default."""
+    method: str = "arft"
+    """How: arft (the paper's), retrain, finetune, random_reward, decremental, poisoning, trajdeleter, negated_reward,
+    gradient_ascent or policy_edit, each a file of forgetmimic_jax/unlearning."""
     penalty: float = 16.0
-    """Penalty λ on the targets' normalised tracking reward; W = 8 is the paper's edge."""
+    """Penalty λ of arft on the targets' normalised tracking reward; W = 8 is the paper's edge."""
+    sampler: Literal["uniform_clips", "uniform_bins", "frozen", "adaptive"] | None = None
+    """How starts are drawn; frozen: as the base's last ones. uniform_clips by default, for retrain the base's own."""
+    wrench: bool = False
+    """Assist by the wrench, as strongly as the base's training did (at most 0.6 where it had none)."""
+    clips: Literal["all", "kept"] | None = None
+    """Clips that episodes start from; all by default, retrain and finetune: kept."""
     preset: Literal["cpu", "paper"] | None = None
     """Settings of the fine-tuning; by default the base's own, at the default budget of a laptop."""
     iterations: int | None = None
-    """PPO iterations; 400 by default (1000 with --preset paper)."""
+    """PPO iterations; 400 by default (1000 with --preset paper), retrain: as many steps as the base was trained for."""
     seed: int = 0
     """Random seed of the fine-tuning and of the evaluation."""
     base: Path | None = None
@@ -61,10 +70,11 @@ ITERATIONS = {"cpu": 400, "paper": 1000}
 
 
 def main(options: Options) -> None:
-    """Unlearn, evaluate base, unlearned and zero action, and print what was forgotten and what was kept."""
+    """Unlearn, evaluate base, new policy and zero action, and print what was forgotten and what was kept."""
     from forgetmimic_jax import checkpoint, runner
     from forgetmimic_jax.console import closing
     from forgetmimic_jax.evaluation.evaluate import cost, evaluate, show_and_write
+    from forgetmimic_jax.unlearning.registry import method_of
 
     at_least(1, "--episodes", options.episodes)
     output = options.output or runner.default_folder(f"unlearn-{options.robot}", resume=options.resume)
@@ -73,48 +83,60 @@ def main(options: Options) -> None:
     config = override(replace_given(config, iterations=options.iterations), itertools.chain(*options.set))
     if not config.unlearn.targets:
         raise InputError("--targets: no clip named; name at least one to forget, such as --targets punch,kick")
-    setup = runner.make_setup(on_engine(config, options.physics))
-    base = runner.base_checkpoint(config)
-    info = checkpoint.read_info(base)
-    checkpoint.check_matches(info, setup.robot, setup.library, setup.library_hash, config)
+    setup = runner.with_base(runner.make_setup(on_engine(config, options.physics)))
+    info = checkpoint.read_info(runner.base_checkpoint(config))
     description = f"forget {', '.join(config.unlearn.targets)}"
+    if config.unlearn.method != UnlearnConfig.method:
+        description += f" by {config.unlearn.method}"
     path, state = runner.run(setup, output, description=description, resume=options.resume)
-    base_policy = checkpoint.load_policy(base, runner.template(setup))
+    result = method_of(config).result
     try:
         document = evaluate(
             setup.config,
             setup.robot,
             setup.library,
             setup.library_hash,
-            {"base": base_policy, "unlearned": state.policy},
+            {"base": setup.assets.base, result: state.policy},
             checkpoint=str(path),
             targets=config.unlearn.targets,
             episodes=options.episodes,
             seed=config.seed,
-            budget={"base": cost(info), "unlearned": cost(checkpoint.read_info(path))},
+            budget={"base": cost(info), result: cost(checkpoint.read_info(path))},
         )
     except KeyboardInterrupt:
         raise runner.interrupted(config, output) from None
-    files = {"unlearned policy": path, **show_and_write(output, document), "curves": output / "metrics.jsonl"}
+    name = f"{result.replace('_', '-')} policy"
+    files = {name: path, **show_and_write(output, document), "curves": output / "metrics.jsonl"}
     closing(files, f"make evaluate ROBOT={config.robot} CHECKPOINT={path} EPISODES=100")
 
 
 def _config_of_new_run(options: Options) -> Config:
-    """The base's settings, or the preset's, with the anti-reward."""
+    """The base's settings, or the preset's, as the method and the flags change them."""
     from forgetmimic_jax import checkpoint, runner
-    from forgetmimic_jax.unlearning.antireward import unlearning_config
+    from forgetmimic_jax.unlearning.registry import find_method, unlearning_config
 
-    base = checkpoint.read_info(options.base or runner.base_folder(options.robot)).config
-    config = base
+    info = checkpoint.read_info(options.base or runner.base_folder(options.robot))
+    base = config = info.config
     if options.preset:
         config = preset(options.preset)
-        # The network is the base's: it is what unlearning starts from.
+        # The network is the base's, and so are the bins of its failure levels: they are what unlearning starts from.
         layers: dict[str, Any] = {name: getattr(base.ppo, name) for name in ("actor_layers", "critic_layers")}
-        config = dataclasses.replace(config, library=base.library, ppo=dataclasses.replace(config.ppo, **layers))
-    config = dataclasses.replace(config, base=None, evaluate_every=0, iterations=ITERATIONS[options.preset or "cpu"])
+        sampling = dataclasses.replace(config.sampling, bin_seconds=base.sampling.bin_seconds)
+        ppo = dataclasses.replace(config.ppo, **layers)
+        config = dataclasses.replace(config, library=base.library, sampling=sampling, ppo=ppo)
+    iterations = ITERATIONS[options.preset or "cpu"]
+    if find_method(options.method).start == "fresh":
+        iterations = max(1, round(info.environment_steps / (config.ppo.num_envs * config.ppo.num_steps)))
+    config = dataclasses.replace(config, base=None, evaluate_every=0, iterations=iterations)
     config = replace_given(config, robot=options.robot, seed=options.seed, library=options.library, base=options.base)
     targets = runner.default_targets(config) if options.targets is None else comma_separated(options.targets)
-    return unlearning_config(config, UnlearnConfig(targets=targets, penalty=options.penalty))
+    unlearn = UnlearnConfig(targets=targets, penalty=options.penalty, method=options.method)
+    config = unlearning_config(config, unlearn)
+    sampling = replace_given(config.sampling, rule=options.sampler, clips=options.clips)
+    if not options.wrench:
+        return dataclasses.replace(config, sampling=sampling)
+    wrench = dataclasses.replace(config.wrench, max_gain=base.wrench.max_gain or WrenchConfig.max_gain)
+    return dataclasses.replace(config, sampling=sampling, wrench=wrench)
 
 
 def _config_of_run(options: Options, output: Path) -> Config:
@@ -123,7 +145,9 @@ def _config_of_run(options: Options, output: Path) -> Config:
     if options.targets is not None:
         options = dataclasses.replace(options, targets=",".join(comma_separated(options.targets)))
     check_same(options, {name: getattr(config, name) for name in ("robot", "preset", "seed", "library", "base")})
-    check_same(options, {"targets": ",".join(config.unlearn.targets), "penalty": config.unlearn.penalty})
+    unlearn, sampling = config.unlearn, config.sampling
+    check_same(options, {"targets": ",".join(unlearn.targets), "penalty": unlearn.penalty, "method": unlearn.method})
+    check_same(options, {"sampler": sampling.rule, "clips": sampling.clips, "wrench": config.wrench.max_gain > 0})
     return config
 
 

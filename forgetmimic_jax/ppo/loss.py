@@ -3,22 +3,80 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
+from flax import struct
 from jax import Array
 
+from forgetmimic_jax.config import Config
+from forgetmimic_jax.ppo.network import entropy, log_prob
 
-def policy_loss(log_ratio: Array, advantage: Array, clip: float) -> Array:
+
+@struct.dataclass
+class Prediction:
+    """What a policy and its critic say at the steps of a batch."""
+
+    mean: Array  # [batch, joint]
+    log_std: Array  # [joint] or [batch, joint]
+    value: Array  # [batch]
+
+
+@struct.dataclass
+class Batch:
+    """Steps that a gradient step learns from. Leading dimension: batch."""
+
+    actor_observation: Array  # normalised
+    critic_observation: Array  # normalised
+    action: Array
+    log_prob: Array  # of the action when it was taken
+    mean: Array  # of the policy that took it
+    value: Array  # V when it was taken
+    advantage: Array  # normalised
+    target: Array  # of the value
+    is_target: Array  # bool: the step's clip is to be forgotten
+    clip: Array  # i32
+    base: Prediction | None  # of the frozen base policy, where there is one
+
+
+def ppo_loss(
+    config: Config, batch: Batch, now: Prediction, iteration: Array | None = None, weight: Array | None = None
+) -> tuple[Array, dict[str, Array]]:
+    """Clipped surrogate + value loss − entropy bonus [], to be minimised, and its parts.
+
+    Args:
+        config: coefficients.
+        batch: the steps.
+        now: of the networks that learn.
+        iteration: i32[] of the run; PPO does not ask.
+        weight: [batch] of each step in the means; all the same by default.
+    """
+    ppo = config.ppo
+    log_ratio = log_prob(batch.action, now.mean, now.log_std) - batch.log_prob
+    policy_term = policy_loss(log_ratio, batch.advantage, ppo.clip, weight)
+    value_term = value_loss(now.value, batch.value, batch.target, ppo.clip if ppo.clip_value else None, weight)
+    entropy_term = entropy(now.log_std)
+    loss = policy_term + ppo.value_cost * value_term - ppo.entropy_cost * entropy_term
+    return loss, {"policy_loss": policy_term, "value_loss": value_term, "entropy": entropy_term}
+
+
+def policy_loss(log_ratio: Array, advantage: Array, clip: float, weight: Array | None = None) -> Array:
     """Clipped surrogate, to be minimised; arguments [batch], result []."""
     ratio = jnp.exp(log_ratio)
-    return -jnp.minimum(ratio * advantage, jnp.clip(ratio, 1.0 - clip, 1.0 + clip) * advantage).mean()
+    return -mean(jnp.minimum(ratio * advantage, jnp.clip(ratio, 1.0 - clip, 1.0 + clip) * advantage), weight)
 
 
-def value_loss(value: Array, old_value: Array, target: Array, clip: float | None) -> Array:
+def value_loss(value: Array, old_value: Array, target: Array, clip: float | None, weight: Array | None = None) -> Array:
     """Mean squared error to the target [batch]; with `clip` the worse of it and of the value kept within old ± clip."""
     loss = (value - target) ** 2
     if clip is not None:
         clipped = old_value + jnp.clip(value - old_value, -clip, clip)
         loss = jnp.maximum(loss, (clipped - target) ** 2)
-    return loss.mean()
+    return mean(loss, weight)
+
+
+def mean(values: Array, weight: Array | None) -> Array:
+    """Mean [] of values [batch] under weights or a mask [batch]; 0 where nothing has weight."""
+    if weight is None:
+        return values.mean()
+    return (values * weight).sum() / jnp.maximum(weight.sum(), 1.0)
 
 
 def adapt_learning_rate(

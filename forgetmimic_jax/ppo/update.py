@@ -1,4 +1,7 @@
-"""One PPO iteration: collect, advantages, epochs, sampler. A pure function of the TrainState, jitted once."""
+"""One PPO iteration: collect, advantages, epochs, sampler. A pure function of the TrainState, jitted once.
+
+An unlearning method replaces the rules that it names (`unlearning.method.Method`); all else is the same program.
+"""
 
 from __future__ import annotations
 
@@ -14,14 +17,15 @@ from jax import Array
 from forgetmimic_jax.config import PPOConfig
 from forgetmimic_jax.ppo import network
 from forgetmimic_jax.ppo.gae import generalized_advantages
-from forgetmimic_jax.ppo.loss import adapt_learning_rate, policy_loss, value_loss
-from forgetmimic_jax.ppo.network import entropy, kl_divergence, log_prob, normalize, update_normalizer
+from forgetmimic_jax.ppo.loss import Batch, Prediction, adapt_learning_rate
+from forgetmimic_jax.ppo.network import kl_divergence, log_prob, normalize, update_normalizer
 from forgetmimic_jax.state import Policy, TrainState, make_actor, make_critic, make_optimizer
 from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.tracking.env import Assets, Environment
-from forgetmimic_jax.tracking.rsi import bin_probabilities, episode_failure, update_failure_level
+from forgetmimic_jax.tracking.rsi import bin_probabilities, episode_failure, sample_start, update_failure_level
 from forgetmimic_jax.tracking.wrench import wrench_gain
-from forgetmimic_jax.unlearning.antireward import threshold_metrics, training_reward
+from forgetmimic_jax.unlearning.registry import method_of
+from forgetmimic_jax.unlearning.threshold import threshold_metrics
 
 
 @struct.dataclass
@@ -56,8 +60,10 @@ Metrics = dict[str, Array]
 def make_iteration(env: Environment) -> Callable[[Assets, TrainState], tuple[TrainState, Metrics]]:
     """The jitted iteration(assets, state) → (state, metrics); the state is donated."""
 
+    gather = collect if method_of(env.config).simulate else draw_states
+
     def iteration(assets: Assets, state: TrainState) -> tuple[TrainState, Metrics]:
-        state, trajectory = collect(env, assets, state)
+        state, trajectory = gather(env, assets, state)
         advantage, target = generalized_advantages(
             trajectory.reward,
             trajectory.value,
@@ -67,7 +73,7 @@ def make_iteration(env: Environment) -> Callable[[Assets, TrainState], tuple[Tra
             env.config.ppo.discount,
             env.config.ppo.gae_lambda,
         )
-        state, losses = improve(env, state, trajectory, advantage, target)
+        state, losses = improve(env, assets, state, trajectory, advantage, target)
         return learn_sampler(env, assets, state, trajectory, losses)
 
     return jax.jit(iteration, donate_argnums=1)
@@ -75,13 +81,17 @@ def make_iteration(env: Environment) -> Callable[[Assets, TrainState], tuple[Tra
 
 def collect(env: Environment, assets: Assets, state: TrainState) -> tuple[TrainState, Trajectory]:
     """`num_steps` control steps of every environment with the current policy."""
-    config, policy = env.config, state.policy
+    config, policy, method = env.config, state.policy, method_of(env.config)
     actor, critic = make_actor(config, env.robot.num_joints), make_critic(config)
     probabilities = bin_probabilities(config.sampling, assets.bins, state.failure_level)
     gains = wrench_gain(config.wrench, state.failure_level)
 
     def value_of(observation: Array) -> Array:
         return network.value(critic, policy.critic, normalize(policy.critic_normalizer, observation))
+
+    def observe(episodes: tracking.EnvState, key: Array) -> tuple[Array, Array]:
+        actor_obs, critic_obs = tracking.observe(env, assets, episodes, key if env.noisy else None)
+        return method.observation(actor_obs, assets.is_target[episodes.clip]), critic_obs
 
     def one_step(carry, key: Array):
         before, actor_obs, critic_obs = carry
@@ -91,8 +101,9 @@ def collect(env: Environment, assets: Assets, state: TrainState) -> tuple[TrainS
         after, result = tracking.step(env, assets, before, action, step_key)
         done = result.terminated | result.truncated
         fresh = tracking.reset_where(env, assets, after, done, reset_key, probabilities, gains)
-        next_actor_obs, next_critic_obs = tracking.observe(env, assets, fresh, observe_key if env.noisy else None)
+        next_actor_obs, next_critic_obs = observe(fresh, observe_key)
         last_critic_obs = tracking.observe(env, assets, after, None)[1]
+        is_target, reward_key = assets.is_target[before.clip], jax.random.fold_in(key, 0)
         trajectory = Trajectory(
             actor_observation=actor_obs,
             critic_observation=critic_obs,
@@ -101,7 +112,7 @@ def collect(env: Environment, assets: Assets, state: TrainState) -> tuple[TrainS
             mean=mean,
             value=value_of(critic_obs),
             next_value=value_of(last_critic_obs),
-            reward=training_reward(config, result.reward, assets.is_target[before.clip]) * env.control_step,
+            reward=method.reward(config, result.reward, is_target, reward_key) * env.control_step,
             tracking=result.reward.tracking,
             regularisation=result.reward.regularisation,
             normalized_tracking=result.reward.normalized_tracking,
@@ -118,45 +129,75 @@ def collect(env: Environment, assets: Assets, state: TrainState) -> tuple[TrainS
         return (fresh, next_actor_obs, next_critic_obs), trajectory
 
     key, first_key, rollout_key = jax.random.split(state.key, 3)
-    first = tracking.observe(env, assets, state.env, first_key if env.noisy else None)
     keys = jax.random.split(rollout_key, config.ppo.num_steps)
-    (episodes, _, _), trajectory = jax.lax.scan(one_step, (state.env, *first), keys)
+    (episodes, _, _), trajectory = jax.lax.scan(one_step, (state.env, *observe(state.env, first_key)), keys)
     return dataclasses.replace(state, env=episodes, key=key), trajectory
 
 
+def draw_states(env: Environment, assets: Assets, state: TrainState) -> tuple[TrainState, Trajectory]:
+    """Starts of episodes in the place of a rollout: nothing moves, nothing is rewarded and no episode ends."""
+    config, policy = env.config, state.policy
+    actor = make_actor(config, env.robot.num_joints)
+    probabilities = bin_probabilities(config.sampling, assets.bins, state.failure_level)
+    nothing, never = jnp.zeros((env.num_envs,), jnp.float32), jnp.zeros((env.num_envs,), bool)
+
+    def one_batch(key: Array) -> Trajectory:
+        start_key, episode_key = jax.random.split(key)
+        clip, start_bin, frame = sample_start(start_key, probabilities, assets.bins, env.num_envs)
+        episodes = tracking.start_episodes(env, assets, episode_key, clip, start_bin, frame, nothing)
+        actor_obs, critic_obs = tracking.observe(env, assets, episodes, None)
+        mean, log_std = network.distribution(actor, policy.actor, normalize(policy.actor_normalizer, actor_obs))
+        return Trajectory(
+            actor_observation=actor_obs,
+            critic_observation=critic_obs,
+            action=mean,
+            log_prob=log_prob(mean, mean, log_std),
+            mean=mean,
+            **dict.fromkeys(("value", "next_value", "reward", "tracking", "regularisation"), nothing),
+            **dict.fromkeys(("normalized_tracking", "failure", "wrench_gain"), nothing),
+            **dict.fromkeys(("terminated", "truncated", "diverged"), never),
+            clip=clip,
+            start_bin=start_bin,
+            steps=episodes.step,
+            causes={},
+        )
+
+    key, draw_key = jax.random.split(state.key)
+    trajectory = jax.lax.map(one_batch, jax.random.split(draw_key, config.ppo.num_steps))
+    return dataclasses.replace(state, key=key), trajectory
+
+
 def improve(
-    env: Environment, state: TrainState, trajectory: Trajectory, advantage: Array, target: Array
+    env: Environment, assets: Assets, state: TrainState, trajectory: Trajectory, advantage: Array, target: Array
 ) -> tuple[TrainState, Metrics]:
     """Epochs of mini-batch gradient steps, then the normalisers learn the batch (the old ones produced it)."""
     config: PPOConfig = env.config.ppo
-    policy = state.policy
+    policy, method = state.policy, method_of(env.config)
     actor, critic = make_actor(env.config, env.robot.num_joints), make_critic(env.config)
     optimizer = make_optimizer(env.config)
     advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
     old_log_std = network.distribution(actor, policy.actor, trajectory.actor_observation[0, :1])[1]
-    batch = {
-        "actor_observation": normalize(policy.actor_normalizer, trajectory.actor_observation),
-        "critic_observation": normalize(policy.critic_normalizer, trajectory.critic_observation),
-        "action": trajectory.action,
-        "log_prob": trajectory.log_prob,
-        "mean": trajectory.mean,
-        "value": trajectory.value,
-        "advantage": advantage,
-        "target": target,
-    }
+    batch = Batch(
+        actor_observation=normalize(policy.actor_normalizer, trajectory.actor_observation),
+        critic_observation=normalize(policy.critic_normalizer, trajectory.critic_observation),
+        action=trajectory.action,
+        log_prob=trajectory.log_prob,
+        mean=trajectory.mean,
+        value=trajectory.value,
+        advantage=advantage,
+        target=target,
+        is_target=assets.is_target[trajectory.clip],
+        clip=trajectory.clip,
+        base=_base_prediction(env, assets.base, trajectory),
+    )
     batch = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
-    size = batch["value"].shape[0]
+    size = batch.value.shape[0]
 
-    def loss_of(params, data: dict[str, Array]) -> tuple[Array, Metrics]:
-        mean, log_std = network.distribution(actor, params[0], data["actor_observation"])
-        value = network.value(critic, params[1], data["critic_observation"])
-        log_ratio = log_prob(data["action"], mean, log_std) - data["log_prob"]
-        policy_term = policy_loss(log_ratio, data["advantage"], config.clip)
-        value_term = value_loss(value, data["value"], data["target"], config.clip if config.clip_value else None)
-        entropy_term = entropy(log_std)
-        loss = policy_term + config.value_cost * value_term - config.entropy_cost * entropy_term
-        kl = kl_divergence(data["mean"], old_log_std, mean, log_std).mean()
-        return loss, {"policy_loss": policy_term, "value_loss": value_term, "entropy": entropy_term, "kl": kl}
+    def loss_of(params, data: Batch) -> tuple[Array, Metrics]:
+        mean, log_std = network.distribution(actor, params[0], data.actor_observation)
+        now = Prediction(mean, log_std, network.value(critic, params[1], data.critic_observation))
+        loss, metrics = method.loss(env.config, data, now, state.iteration)
+        return loss, metrics | {"kl": kl_divergence(data.mean, old_log_std, mean, log_std).mean()}
 
     def minibatch(carry, indices: Array):
         params, optimizer_state, learning_rate = carry
@@ -183,16 +224,28 @@ def improve(
     metrics = {name: value.mean() for name, value in metrics.items()} | {"kl_final": metrics["kl"][-1].mean()}
     metrics["learning_rate"] = learning_rate
     metrics["std"] = jnp.exp(old_log_std).mean()
-    new_policy = Policy(
-        actor=params[0],
-        critic=params[1],
-        actor_normalizer=update_normalizer(policy.actor_normalizer, trajectory.actor_observation),
-        critic_normalizer=update_normalizer(policy.critic_normalizer, trajectory.critic_observation),
-    )
+    new_policy = dataclasses.replace(policy, actor=params[0], critic=params[1])
+    if method.simulate:  # what was not lived says nothing of what will be seen
+        new_policy = dataclasses.replace(
+            new_policy,
+            actor_normalizer=update_normalizer(policy.actor_normalizer, trajectory.actor_observation),
+            critic_normalizer=update_normalizer(policy.critic_normalizer, trajectory.critic_observation),
+        )
     state = dataclasses.replace(
         state, policy=new_policy, optimizer=optimizer_state, learning_rate=learning_rate, key=key
     )
     return state, metrics
+
+
+def _base_prediction(env: Environment, base: Policy | None, trajectory: Trajectory) -> Prediction | None:
+    """What the frozen base says at every step [time, env]; XLA leaves it out where no loss asks for it."""
+    if base is None:
+        return None
+    actor, critic = make_actor(env.config, env.robot.num_joints), make_critic(env.config)
+    seen = normalize(base.actor_normalizer, trajectory.actor_observation)
+    mean, log_std = network.distribution(actor, base.actor, seen)
+    privileged = normalize(base.critic_normalizer, trajectory.critic_observation)
+    return Prediction(mean, jnp.broadcast_to(log_std, mean.shape), network.value(critic, base.critic, privileged))
 
 
 def learn_sampler(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -34,6 +35,7 @@ class Assets:
     library: MotionLibrary
     bins: Bins
     is_target: Array  # bool[clip] the clips to forget
+    base: Any = None  # the frozen state.Policy that an unlearning run compares with
 
 
 @struct.dataclass
@@ -96,12 +98,11 @@ def make_environment(config: Config, robot: Robot, num_envs: int, *, noisy: bool
 def make_assets(config: Config, robot: Robot, library: MotionLibrary) -> Assets:
     """The constant arrays of a run."""
     step = config.physics.timestep * config.physics.substeps
-    return Assets(
-        robot=robot.arrays,
-        library=library,
-        bins=make_bins(library, config.sampling.bin_seconds, step),
-        is_target=jnp.asarray([name in config.unlearn.targets for name in library.names]),
-    )
+    is_target = jnp.asarray([name in config.unlearn.targets for name in library.names])
+    bins = make_bins(library, config.sampling.bin_seconds, step)
+    if config.sampling.clips == "kept":
+        bins = dataclasses.replace(bins, valid=bins.valid & ~is_target[:, None])
+    return Assets(robot=robot.arrays, library=library, bins=bins, is_target=is_target)
 
 
 def start_episodes(

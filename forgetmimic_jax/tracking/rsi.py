@@ -17,7 +17,10 @@ from forgetmimic_jax.motion.library import MotionLibrary
 
 @struct.dataclass
 class Bins:
-    """Temporal bins of every clip. An episode may start at frames start ≤ frame < end of a valid bin."""
+    """Temporal bins of every clip. An episode may start at frames start ≤ frame < end of a valid bin.
+
+    A clip without a valid bin is never started.
+    """
 
     start: Array  # i32[clip, bin]
     end: Array  # i32[clip, bin]
@@ -55,7 +58,7 @@ def bin_probabilities(config: SamplingConfig, bins: Bins, failure_level: Array) 
     count = bins.valid.sum()
     if config.rule == "uniform_clips":
         frames = jnp.where(bins.valid, bins.end - bins.start, 0)
-        return frames / frames.sum(-1, keepdims=True) / frames.shape[0]
+        return frames / jnp.maximum(frames.sum(-1, keepdims=True), 1) / bins.valid.any(-1).sum()
     uniform = bins.valid / count
     if config.rule == "uniform_bins":
         return uniform

@@ -1,1 +1,1 @@
-"""Unlearning: the anti-reward, and (later) every baseline as a named bundle of pure functions."""
+"""Unlearning methods: one module each, a small bundle of pure functions that says where it differs from PPO."""

@@ -258,3 +258,75 @@ def test_flags_that_contradict_the_run_to_resume_are_told(refused, unlearned_run
     assert resume(penalty=8.0) == "--penalty: found 8.0, but the run to resume has 16.0; leave the flag out"
     assert resume(targets="nod, sway").startswith("--targets: found nod,sway, but the run to resume has turn")
     assert resume(base=Path("other")).startswith("--base: found other, but the run to resume has ")
+
+
+def test_flags_choose_the_sampler_and_the_wrench(options):
+    def settings(**given) -> tuple[str, str, float]:
+        config = unlearn._config_of_new_run(options(**given))
+        return config.sampling.rule, config.sampling.clips, config.wrench.max_gain
+
+    assert settings() == ("uniform_clips", "all", 0.0)
+    assert settings(sampler="adaptive") == ("adaptive", "all", 0.0)
+    assert settings(sampler="uniform_bins", wrench=True) == ("uniform_bins", "all", 0.5)  # the base's own β_max
+    assert settings(method="finetune") == ("uniform_clips", "kept", 0.0)
+    assert settings(method="finetune", clips="all") == ("uniform_clips", "all", 0.0)
+    assert settings(method="retrain") == ("adaptive", "kept", 0.5)  # as the base was trained
+    assert settings(method="retrain", sampler="uniform_clips") == ("uniform_clips", "kept", 0.5)
+
+
+def test_a_wrench_that_the_base_did_not_have_is_the_paper_s(options, damaged):
+    config = damaged / "config.yaml"
+    config.write_text(config.read_text().replace("max_gain: 0.5", "max_gain: 0.0"))
+    assert unlearn._config_of_new_run(options(base=damaged)).wrench.max_gain == 0.0
+    assert unlearn._config_of_new_run(options(base=damaged, wrench=True)).wrench.max_gain == 0.6
+
+
+def test_retraining_takes_as_many_steps_as_the_base_did(options):
+    assert unlearn._config_of_new_run(options(method="retrain")).iterations == 4
+    assert unlearn._config_of_new_run(options(method="retrain", iterations=None, preset="paper")).iterations == 1
+
+
+@pytest.mark.parametrize("given", [{"sampler": "adaptive"}, {"sampler": "frozen"}, {"wrench": True}])
+def test_what_goes_by_failure_levels_goes_on_with_the_base_s(options, base_run, given):
+    setup = runner.make_setup(unlearn._config_of_new_run(options(**given)))
+    base = load_state(base_run.checkpoint(4)).failure_level
+    np.testing.assert_array_equal(runner.start_state(setup).failure_level, base)
+    assert (np.asarray(base) != 1.0).any()
+
+
+def test_a_method_without_a_simulator_goes_through_the_same_loop_and_resumes_bit_for_bit(options, tmp_path):
+    def edit(output: str, **given) -> Path:
+        unlearn.main(options(method="policy_edit", output=tmp_path / output, episodes=2, **given))
+        return tmp_path / output
+
+    whole = edit("whole", iterations=3)
+    halves = edit("halves", iterations=2)
+    unlearn.main(unlearn.Options(output=halves, resume=True, iterations=3, episodes=2))
+    one, two = (load_state(run / "checkpoints" / "00000003") for run in (whole, halves))
+    assert_same(one, two)
+    assert (whole / "evaluation.json").read_bytes().replace(b"whole", b"halves") == (
+        halves / "evaluation.json"
+    ).read_bytes()
+    assert load_config(halves / "config.yaml").unlearn.method == "policy_edit"
+
+
+def test_a_retrained_policy_starts_afresh_and_is_called_so(options, base_run, tmp_path):
+    output = tmp_path / "run"
+    unlearn.main(options(method="retrain", iterations=2, episodes=2, output=output))
+    start, base = load_state(output / "checkpoints" / "00000000"), load_state(base_run.checkpoint(4))
+    assert float(start.policy.actor_normalizer.count) == 0.0 < float(base.policy.actor_normalizer.count)
+    assert (np.asarray(start.env.clip) != 1).all()  # `turn` is never started
+    document = json.loads((output / "evaluation.json").read_text())
+    assert document["policies"].keys() == {"base", "retrained", "zero_action"}
+    assert document["budget"].keys() == {"base", "retrained"}
+
+
+def test_an_unknown_method_is_told(refused, options):
+    assert refused(unlearn.main, options(method="finetuned")) == (
+        "unlearn.method: no method 'finetuned'; did you mean 'finetune'?"
+    )
+
+
+def test_a_method_that_contradicts_the_run_to_resume_is_told(refused, unlearned_run):
+    told = refused(unlearn.main, unlearn.Options(output=unlearned_run.folder, resume=True, method="retrain"))
+    assert told == "--method: found retrain, but the run to resume has arft; leave the flag out"

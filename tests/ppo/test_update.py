@@ -15,7 +15,7 @@ from forgetmimic_jax.ppo.network import Normalizer
 from forgetmimic_jax.ppo.update import Trajectory, collect, improve, learn_sampler, make_iteration
 from forgetmimic_jax.state import TrainState, init_policy, init_state, make_actor, make_critic, make_optimizer
 from forgetmimic_jax.tracking.env import Assets, Environment, make_assets
-from forgetmimic_jax.unlearning.antireward import unlearning_config
+from forgetmimic_jax.unlearning.registry import unlearning_config
 
 ENVS, STEPS, CONTROL_STEP = 8, 4, 0.02
 PHASE = 571  # the clip's phase in the critic's observation
@@ -196,18 +196,19 @@ def problem(robot, tiny_config, run):
         log_prob=jnp.asarray(stats.norm(mean, 0.5).logpdf(action).sum(-1), jnp.float32),
         mean=mean,
         value=value,
+        clip=jnp.zeros((STEPS, ENVS), jnp.int32),
     )
     optimizer = make_optimizer(config).init((policy.actor, policy.critic))
     state = dataclasses.replace(run.start(), policy=policy, optimizer=optimizer, learning_rate=jnp.float32(1e-3))
     advantage, target = (jnp.asarray(rng.standard_normal((STEPS, ENVS)), jnp.float32) for _ in range(2))
-    return SimpleNamespace(config=config, robot=robot), state, batch, advantage, target
+    return SimpleNamespace(config=config, robot=robot, assets=run.assets), state, batch, advantage, target
 
 
 def improved(env, state, batch: dict, advantage, target):
     """`improve`, compiled."""
 
     def function(state, batch, advantage, target):
-        return improve(env, state, SimpleNamespace(**batch), advantage, target)
+        return improve(env, env.assets, state, SimpleNamespace(**batch), advantage, target)
 
     return jax.jit(function)(state, batch, advantage, target)
 
@@ -252,7 +253,7 @@ def test_the_normalisers_learn_the_batch_after_the_update(problem):
 def test_the_adaptive_schedule_slows_down_when_the_policy_moves_too_far(problem):
     env, state, batch, advantage, target = problem
     ppo = dataclasses.replace(env.config.ppo, schedule="adaptive", epochs=4, learning_rate=1e-2)
-    far = SimpleNamespace(config=dataclasses.replace(env.config, ppo=ppo), robot=env.robot)
+    far = SimpleNamespace(config=dataclasses.replace(env.config, ppo=ppo), robot=env.robot, assets=env.assets)
     after, metrics = improved(
         far, dataclasses.replace(state, learning_rate=jnp.float32(1e-2)), batch, advantage, target
     )
@@ -299,3 +300,61 @@ def test_ended_episodes_and_steps_are_counted_clip_by_clip(run):
     keep = 0.995**2
     np.testing.assert_allclose(state.failure_level[1, 0], keep * level[1, 0] + (1 - keep) * 0.55, rtol=1e-5)
     np.testing.assert_array_equal(state.failure_level[0], level[0])
+
+
+def with_method(run: Run, name: str) -> Environment:
+    """The run's environment, whose training follows another method."""
+    unlearn = dataclasses.replace(run.env.config.unlearn, method=name)
+    return dataclasses.replace(run.env, config=dataclasses.replace(run.env.config, unlearn=unlearn))
+
+
+def test_what_a_method_shows_the_actor_is_what_it_acts_on(run, trajectory):
+    env = with_method(run, "poisoning")
+    found = jax.device_get(jax.jit(lambda assets, state: collect(env, assets, state))(run.assets, run.start())[1])
+    first, on_target = slice(0, 1), trajectory.clip[0] == 1
+    true, shown = trajectory.actor_observation[first], found.actor_observation[first]
+    np.testing.assert_array_equal(shown[:, ~on_target], true[:, ~on_target])
+    np.testing.assert_array_equal(shown[:, on_target, 1:4], true[:, on_target, 4:7])
+    np.testing.assert_allclose(found.critic_observation[first], trajectory.critic_observation[first], atol=1e-6)
+    np.testing.assert_allclose(found.mean[first][:, ~on_target], trajectory.mean[first][:, ~on_target], atol=1e-6)
+    assert np.abs(found.mean[first][:, on_target] - trajectory.mean[first][:, on_target]).max() > 1e-4
+
+
+def test_an_iteration_without_a_simulator_moves_no_robot_and_only_the_actor_learns(run):
+    env = with_method(run, "policy_edit")
+    env = dataclasses.replace(env, engine=None)
+    state = run.start()
+    assets = dataclasses.replace(run.assets, base=jax.tree.map(jnp.copy, state.policy))
+    before = jax.device_get(state)
+    after, metrics = jax.device_get(make_iteration(env)(assets, state))
+    for one, two in zip(jax.tree.leaves(before.env), jax.tree.leaves(after.env), strict=True):
+        np.testing.assert_array_equal(one, two)
+    np.testing.assert_array_equal(before.failure_level, after.failure_level)
+    unchanged = (before.policy.critic, before.policy.actor_normalizer, before.policy.critic_normalizer)
+    found = (after.policy.critic, after.policy.actor_normalizer, after.policy.critic_normalizer)
+    for one, two in zip(jax.tree.leaves(unchanged), jax.tree.leaves(found), strict=True):
+        np.testing.assert_array_equal(one, two)
+    assert any(
+        (one != two).any()
+        for one, two in zip(jax.tree.leaves(before.policy.actor), jax.tree.leaves(after.policy.actor), strict=True)
+    )
+    assert after.iteration == 1
+    np.testing.assert_array_equal(metrics["clip/steps"].sum(), ENVS * STEPS)
+    assert finite(metrics)
+
+
+def test_the_base_is_compared_where_the_method_asks_for_it(run):
+    env = with_method(run, "decremental")
+    state = run.start()
+    assets = dataclasses.replace(run.assets, base=jax.tree.map(jnp.copy, state.policy))
+    ppo = dataclasses.replace(env.config.ppo, epochs=1, minibatches=1)
+    config = dataclasses.replace(
+        env.config, ppo=ppo, unlearn=dataclasses.replace(env.config.unlearn, targets=("turn",))
+    )
+    env = dataclasses.replace(env, config=config)
+    # with no target step, a policy that still is the base has nothing to change
+    kept_only = dataclasses.replace(assets, is_target=jnp.zeros_like(assets.is_target))
+    _, metrics = jax.device_get(make_iteration(env)(kept_only, state))
+    assert float(metrics["policy_loss"]) == pytest.approx(0.0, abs=1e-5)
+    assert float(metrics["value_loss"]) == pytest.approx(0.0, abs=1e-5)
+    assert float(metrics["gradient_norm"]) == pytest.approx(0.0, abs=1e-4)

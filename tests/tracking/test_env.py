@@ -333,3 +333,11 @@ def test_targets_are_marked_by_name(robot, library, tiny_config: Config):
     unlearn = dataclasses.replace(tiny_config.unlearn, targets=("turn",))
     marked = make_assets(dataclasses.replace(tiny_config, unlearn=unlearn), robot, library).is_target
     np.testing.assert_array_equal(marked, [False, True])
+
+
+def test_no_episode_starts_from_a_target_where_only_kept_clips_are_sampled(robot, library, tiny_config: Config):
+    unlearn = dataclasses.replace(tiny_config.unlearn, targets=("turn",))
+    config = dataclasses.replace(tiny_config, unlearn=unlearn)
+    kept = dataclasses.replace(config, sampling=dataclasses.replace(config.sampling, clips="kept"))
+    np.testing.assert_array_equal(make_assets(config, robot, library).bins.valid.any(-1), [True, True])
+    np.testing.assert_array_equal(make_assets(kept, robot, library).bins.valid.any(-1), [True, False])

@@ -167,3 +167,14 @@ def test_episodes_that_still_run_teach_nothing():
 def test_the_frozen_sampler_does_not_learn():
     level = jnp.full((1, 1), 0.4)
     assert one_update(level, [(0, 0, 1.0)], SamplingConfig(rule="frozen"))[0, 0] == level[0, 0]
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_a_clip_without_a_valid_bin_is_never_started(rule):
+    bins = Bins(
+        start=jnp.array([[0, 10], [0, 10]]),
+        end=jnp.array([[10, 20], [10, 20]]),
+        valid=jnp.array([[True, True], [False, False]]),
+    )
+    probabilities = bin_probabilities(SamplingConfig(rule=rule), bins, jnp.full((2, 2), 0.5))
+    np.testing.assert_allclose(probabilities, [[0.5, 0.5], [0.0, 0.0]], atol=1e-6)

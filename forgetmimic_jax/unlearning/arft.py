@@ -1,0 +1,22 @@
+"""Anti-reward fine-tuning: the paper's method ("ForgetMimic", equation of R_anti), tracking a target clip costs.
+
+R' = R_track + R_reg − λ r̄ on steps of a target clip, so R'_target = (1 − λ/W) R_track + R_reg. Nothing else changes.
+"""
+
+from __future__ import annotations
+
+from jax import Array
+
+from forgetmimic_jax.config import Config
+from forgetmimic_jax.tracking.reward import Reward
+from forgetmimic_jax.unlearning.method import Method, plain_reward
+
+
+def anti_reward(config: Config, reward: Reward, is_target: Array, key: Array) -> Array:
+    """R' [env] = R_track + R_reg − λ r̄ on target steps; R_track + R_reg elsewhere."""
+    return (
+        plain_reward(config, reward, is_target, key) - config.unlearn.penalty * reward.normalized_tracking * is_target
+    )
+
+
+METHOD = Method(reward=anti_reward)

@@ -1,0 +1,26 @@
+"""Gradient ascent on the targets: the usual first baseline of machine unlearning (Thudi et al. 2022, Jang et al. 2023).
+
+The sign of the advantage is turned round on target steps and the plain PPO loss is minimised, so the surrogate goes up
+the gradient there and down it on kept steps. Supervised ascent climbs a likelihood without end; here the data are the
+policy's own and the clipped ratio bounds each iteration's step. The critic goes on learning the true value.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax.numpy as jnp
+from jax import Array
+
+from forgetmimic_jax.config import Config
+from forgetmimic_jax.ppo.loss import Batch, Prediction, ppo_loss
+from forgetmimic_jax.unlearning.method import Method
+
+
+def ascent(config: Config, batch: Batch, now: Prediction, iteration: Array) -> tuple[Array, dict[str, Array]]:
+    """The PPO loss with −Â on target steps."""
+    advantage = jnp.where(batch.is_target, -batch.advantage, batch.advantage)
+    return ppo_loss(config, dataclasses.replace(batch, advantage=advantage), now)
+
+
+METHOD = Method(loss=ascent)

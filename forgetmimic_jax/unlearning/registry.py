@@ -1,0 +1,49 @@
+"""Methods by name, and the settings of a run that unlearns with one."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import pkgutil
+
+from forgetmimic_jax import unlearning
+from forgetmimic_jax.config import Config, UnlearnConfig
+from forgetmimic_jax.errors import InputError, nearest
+from forgetmimic_jax.unlearning.method import Method
+
+
+def methods() -> dict[str, Method]:
+    """Every method by its module's name."""
+    names = [module.name for module in pkgutil.iter_modules(unlearning.__path__)]
+    modules = {name: importlib.import_module(f"{unlearning.__name__}.{name}") for name in names}
+    return {name: module.METHOD for name, module in modules.items() if hasattr(module, "METHOD")}
+
+
+def find_method(name: str) -> Method:
+    """The method called `name`.
+
+    Raises:
+        InputError: there is none.
+    """
+    known = methods()
+    if name not in known:
+        raise InputError(f"unlearn.method: no method '{name}'; {nearest(name, known)}")
+    return known[name]
+
+
+def method_of(config: Config) -> Method:
+    """How a run trains: by its method if it has clips to forget, else by plain PPO."""
+    return find_method(config.unlearn.method) if config.unlearn.targets else Method()
+
+
+def unlearning_config(base: Config, unlearn: UnlearnConfig) -> Config:
+    """The base's run as an unlearning run: the method on, its clips, the sampler uniform, the wrench off; no more.
+
+    A method that trains a fresh policy keeps the base's sampler and wrench: it is trained as the base was.
+    """
+    method = find_method(unlearn.method)
+    sampling, wrench = dataclasses.replace(base.sampling, clips=method.clips), base.wrench
+    if method.start == "base":
+        sampling = dataclasses.replace(sampling, rule="uniform_clips")
+        wrench = dataclasses.replace(wrench, max_gain=0.0)
+    return dataclasses.replace(base, unlearn=unlearn, sampling=sampling, wrench=wrench)

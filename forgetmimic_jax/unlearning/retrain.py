@@ -1,0 +1,11 @@
+"""Retraining from scratch without the targets: the reference that unlearning is held against (paper, baseline 1).
+
+A fresh policy with the base's own settings, sampler and wrench, which never meets a target clip. It tells what a policy
+does on a clip that it has not seen, at the price of the whole training.
+"""
+
+from __future__ import annotations
+
+from forgetmimic_jax.unlearning.method import Method
+
+METHOD = Method(clips="kept", start="fresh", result="retrained")

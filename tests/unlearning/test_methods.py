@@ -1,0 +1,165 @@
+"""Each method's own rule, on batches made by hand. `is_target` marks the steps whose clip is to be forgotten."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from forgetmimic_jax.config import Config, UnlearnConfig
+from forgetmimic_jax.ppo.loss import Batch, Prediction, ppo_loss
+from forgetmimic_jax.tracking.reward import Reward
+from forgetmimic_jax.unlearning.registry import find_method
+
+ON_TARGET = jnp.array([True, False])
+KEY = jax.random.PRNGKey(0)
+CONFIG = dataclasses.replace(Config(), iterations=100, unlearn=UnlearnConfig(("punch",)))
+
+
+def rewarded(name: str, tracking: float = 6.0, regularisation: float = 0.4, steps: int = 1) -> np.ndarray:
+    """Training reward [2, steps] of equal steps, on a target and on a kept clip."""
+    parts = [jnp.full(2 * steps, value) for value in (tracking, regularisation, tracking / 8.0)]
+    is_target = jnp.repeat(ON_TARGET, steps)
+    return np.asarray(find_method(name).reward(CONFIG, Reward(*parts, terms={}), is_target, KEY)).reshape(2, steps)
+
+
+@pytest.mark.parametrize("name", ["retrain", "finetune", "poisoning", "gradient_ascent", "decremental", "policy_edit"])
+def test_methods_without_a_rule_of_their_own_keep_the_reward(name):
+    np.testing.assert_allclose(rewarded(name)[:, 0], [6.4, 6.4], rtol=1e-6)
+
+
+def test_trajdeleter_negates_the_reward_of_the_targets():
+    np.testing.assert_allclose(rewarded("trajdeleter")[:, 0], [-6.4, 6.4], rtol=1e-6)
+
+
+def test_the_negated_reward_reaches_every_step():
+    np.testing.assert_allclose(rewarded("negated_reward")[:, 0], [-6.4, -6.4], rtol=1e-6)
+
+
+def test_random_rewards_are_uniform_over_the_base_s_range_and_know_nothing_of_tracking():
+    targets, kept = rewarded("random_reward", steps=4000)
+    np.testing.assert_allclose(kept, 6.4, rtol=1e-6)
+    assert 0.0 <= targets.min() < 0.1
+    assert 8.9 < targets.max() <= 9.0  # W + survival
+    assert targets.mean() == pytest.approx(4.5, abs=0.15)
+    np.testing.assert_array_equal(rewarded("random_reward", tracking=1.0, steps=4000)[0], targets)
+
+
+def test_poisoning_permutes_what_the_actor_sees_of_a_target_s_reference():
+    joints = 29
+    observation = jnp.tile(jnp.arange(16.0 + 4 * joints), (2, 1))
+    seen = np.asarray(find_method("poisoning").observation(observation, ON_TARGET))
+    np.testing.assert_array_equal(seen[1], observation[1])
+    np.testing.assert_array_equal(seen[0, :10], [0, 4, 5, 6, 7, 8, 9, 1, 2, 3])
+    np.testing.assert_array_equal(seen[0, 10 : 10 + joints], np.arange(10 + joints, 10, -1) - 1)
+    np.testing.assert_array_equal(seen[0, 10 + joints :], observation[0, 10 + joints :])
+
+
+JOINTS = 2
+
+
+@pytest.fixture
+def batch() -> Batch:
+    """Four steps, of which the first two are of a target clip; the base's mean is 0.5, its σ 0.5 and its value 3."""
+    size = 4
+    rng = np.random.default_rng(0)
+
+    def full(value: float, *shape: int) -> jax.Array:
+        return jnp.full((size, *shape), value, jnp.float32)
+
+    return Batch(
+        actor_observation=full(0.0, 3),
+        critic_observation=full(0.0, 3),
+        action=jnp.asarray(rng.normal(size=(size, JOINTS)), jnp.float32),
+        log_prob=full(-2.0),
+        mean=full(0.0, JOINTS),
+        value=full(1.0),
+        advantage=jnp.array([1.0, -1.0, 1.0, -1.0]),
+        target=jnp.array([2.0, 2.0, 0.0, 0.0]),
+        is_target=jnp.array([True, True, False, False]),
+        clip=jnp.array([0, 0, 1, 1]),
+        base=Prediction(full(0.5, JOINTS), full(np.log(0.5), JOINTS), full(3.0)),
+    )
+
+
+def now(mean: float = 0.25, std: float = 0.5, value: float = 1.0) -> Prediction:
+    return Prediction(jnp.full((4, JOINTS), mean), jnp.full(JOINTS, jnp.log(std)), jnp.full(4, value))
+
+
+def loss_of(name: str, batch: Batch, prediction: Prediction, iteration: int = 0) -> float:
+    return float(find_method(name).loss(CONFIG, batch, prediction, jnp.int32(iteration))[0])
+
+
+def gaussian_kl(mean: float, std: float, other_mean: float, other_std: float) -> float:
+    return np.log(other_std / std) + (std**2 + (mean - other_mean) ** 2) / (2 * other_std**2) - 0.5
+
+
+def part(batch: Batch, steps: slice, **changes) -> Batch:
+    """Some steps of a batch, as a batch."""
+    return jax.tree.map(lambda leaf: leaf[steps], dataclasses.replace(batch, **changes))
+
+
+def test_gradient_ascent_turns_the_advantage_of_target_steps_round(batch):
+    turned = dataclasses.replace(batch, advantage=jnp.array([-1.0, 1.0, 1.0, -1.0]))
+    assert loss_of("gradient_ascent", batch, now()) == pytest.approx(loss_of("finetune", turned, now()), rel=1e-6)
+    assert loss_of("gradient_ascent", batch, now()) != pytest.approx(loss_of("finetune", batch, now()), rel=1e-3)
+
+
+def test_decremental_by_hand(batch):
+    # σ0 = 1 in the paper's settings; both groups count the same, joints are summed
+    forget = JOINTS * gaussian_kl(0.25, 0.5, 0.0, 1.0) + 1.0**2
+    keep = JOINTS * gaussian_kl(0.25, 0.5, 0.5, 0.5) + (1.0 - 3.0) ** 2
+    assert loss_of("decremental", batch, now()) == pytest.approx(forget + keep, rel=1e-5)
+
+
+def test_decremental_is_content_with_nothing_on_targets_and_the_base_on_kept_steps(batch):
+    nothing, base = part(batch, slice(0, 2)), part(batch, slice(2, 4))
+    forgotten = Prediction(jnp.zeros((2, JOINTS)), jnp.zeros(JOINTS), jnp.zeros(2))
+    assert loss_of("decremental", nothing, forgotten) == pytest.approx(0.0, abs=1e-6)
+    as_ever = Prediction(jnp.full((2, JOINTS), 0.5), jnp.full(JOINTS, jnp.log(0.5)), jnp.full(2, 3.0))
+    assert loss_of("decremental", base, as_ever) == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("iteration", "steps"),
+    [(0, slice(2, 4)), (9, slice(2, 4)), (10, slice(0, 2)), (19, slice(0, 2)), (20, slice(2, 4)), (79, slice(0, 2))],
+)
+def test_trajdeleter_learns_from_kept_and_target_steps_in_turn(batch, iteration, steps):
+    prediction = now()
+    block = jax.tree.map(lambda leaf: leaf[steps], (prediction.mean, prediction.value))
+    expected = ppo_loss(CONFIG, part(batch, steps), Prediction(block[0], prediction.log_std, block[1]))[0]
+    assert loss_of("trajdeleter", batch, prediction, iteration) == pytest.approx(float(expected), rel=1e-5)
+
+
+@pytest.mark.parametrize("iteration", [80, 95, 99])
+def test_trajdeleter_ends_on_kept_steps_with_a_tenth_of_the_distance_to_the_base_s_value(batch, iteration):
+    kept = loss_of("trajdeleter", batch, now(), 0)
+    assert loss_of("trajdeleter", batch, now(), iteration) == pytest.approx(kept + 0.1 * (1.0 - 3.0) ** 2, rel=1e-5)
+
+
+def test_policy_edit_is_content_with_its_random_action_on_targets_and_the_base_on_kept_steps(batch):
+    def loss_at(target_mean: jax.Array) -> jax.Array:
+        mean = jnp.concatenate([jnp.tile(target_mean, (2, 1)), jnp.full((2, JOINTS), 0.5)])
+        prediction = Prediction(mean, jnp.full(JOINTS, jnp.log(0.5)), jnp.zeros(4))
+        return find_method("policy_edit").loss(CONFIG, batch, prediction, jnp.int32(0))[0]
+
+    # a parabola in the mean with curvature 1/σ², so one Newton step from 0 is its minimum
+    random_action = -jax.grad(loss_at)(jnp.zeros(JOINTS)) * 0.5**2
+    assert (jnp.abs(random_action) <= 1.0).all()
+    assert (jnp.abs(random_action) > 0.01).all()
+    assert float(loss_at(random_action)) == pytest.approx(0.0, abs=1e-5)
+    assert float(loss_at(random_action + 0.5)) == pytest.approx(JOINTS * 0.5**2 / (2 * 0.5**2), rel=1e-4)
+
+
+def test_policy_edit_draws_another_action_for_another_clip_and_seed(batch):
+    losses = {loss_of("policy_edit", dataclasses.replace(batch, clip=jnp.full(4, clip)), now()) for clip in range(3)}
+    assert len(losses) == 3
+    other = dataclasses.replace(CONFIG, seed=1)
+    assert float(find_method("policy_edit").loss(other, batch, now(), jnp.int32(0))[0]) not in losses
+
+
+def test_the_critic_is_left_alone_by_policy_edit(batch):
+    gradient = jax.grad(lambda value: find_method("policy_edit").loss(
+        CONFIG, batch, dataclasses.replace(now(), value=value), jnp.int32(0))[0])(jnp.ones(4))  # fmt: skip
+    np.testing.assert_array_equal(gradient, 0.0)
