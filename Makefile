@@ -12,7 +12,8 @@
 ## ITERATIONS   training iterations
 ## SEED         random seed
 ## BASE         the policy to start from (default: the shipped one; for pretrain, none)
-## CHECKPOINT   the policy to evaluate or export
+## CHECKPOINT   the policy to evaluate, export, play or film
+## CLIPS        clips to film, comma-separated (default: all)
 ## EPISODES     episodes a clip in an evaluation (default: 20)
 ## OUTPUT       folder for the results (default: a folder under runs/)
 ## RESUME       1 goes on with the run in OUTPUT
@@ -30,7 +31,7 @@ TARGET_FLAGS = $(call flag,targets,TARGETS) $(call flag,episodes,EPISODES)
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help unlearn pretrain evaluate export motions bench tables test lint format clean
+.PHONY: help unlearn pretrain evaluate export video motions bench tables test lint format clean
 
 help: ## this list
 	@echo 'make TARGET [VARIABLE=value ...]'
@@ -52,6 +53,11 @@ evaluate: .venv/.installed ## evaluate CHECKPOINT clip by clip
 export: .venv/.installed ## write CHECKPOINT as ONNX for deploy tools, checked in plain MuJoCo
 	$(MODULE).export $(strip --robot $(ROBOT) $(call flag,library,LIBRARY) $(call flag,seed,SEED) \
 		$(call flag,output,OUTPUT) $(call flag,checkpoint,CHECKPOINT) $(call flag,episodes,EPISODES) $(ARGS))
+
+video: .venv/.installed ## film CHECKPOINT clip by clip, beside its base: MP4, GIF and a page of stills
+	$(MODULE).video $(strip --robot $(ROBOT) $(call flag,library,LIBRARY) $(call flag,seed,SEED) \
+		$(call flag,output,OUTPUT) $(call flag,checkpoint,CHECKPOINT) $(call flag,base,BASE) \
+		$(call flag,clips,CLIPS) $(ARGS))
 
 motions: .venv/.installed ## make a library from your own clips (ARGS=--help says how)
 	$(MODULE).motions $(strip --robot $(ROBOT) $(ARGS))

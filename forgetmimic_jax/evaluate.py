@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from forgetmimic_jax.errors import run_command
-from forgetmimic_jax.options import at_least, comma_separated, on_engine, parse, replace_given
+from forgetmimic_jax.options import at_least, comma_separated, parse
 
 
 @dataclass
@@ -36,44 +36,36 @@ class Options:
 
 def main(options: Options) -> None:
     """Evaluate, write the files and print the table."""
-    from forgetmimic_jax import checkpoint, runner
+    from forgetmimic_jax import runner
+    from forgetmimic_jax.comparison import load_comparison
     from forgetmimic_jax.console import closing
     from forgetmimic_jax.evaluation.evaluate import cost, evaluate, show_and_write
-    from forgetmimic_jax.unlearning.registry import method_of
 
     at_least(1, "--episodes", options.episodes)
     at_least(0, "--seed", options.seed)
     path = options.checkpoint or runner.base_folder(options.robot)
     output = options.output or runner.folder_of(path) or Path("runs") / f"evaluate-{options.robot}"
     runner.check_writable(output)
-    info = checkpoint.read_info(path)
-    config = on_engine(replace_given(info.config, robot=options.robot, library=options.library), options.physics)
-    setup = runner.make_setup(config)
-    checkpoint.check_matches(info, setup.robot, setup.library, setup.library_hash, config)
-    targets = info.config.unlearn.targets if options.targets is None else comma_separated(options.targets)
-    runner.check_targets(targets, setup.library.names)
-    shapes = runner.template(setup)
-    unlearned = bool(info.config.unlearn.targets)
-    name: str = method_of(info.config).result if unlearned else "base"
-    policies = {name: checkpoint.load_policy(path, shapes)}
-    budget = {name: cost(info)}
-    if unlearned:
-        base = options.base or runner.base_checkpoint(info.config)
-        base_info = checkpoint.read_info(base)
-        checkpoint.check_matches(base_info, setup.robot, setup.library, setup.library_hash, config)
-        policies = {"base": checkpoint.load_policy(base, shapes), **policies}
-        budget["base"] = cost(base_info)
+    compared = load_comparison(
+        path,
+        robot=options.robot,
+        base=options.base,
+        targets=None if options.targets is None else comma_separated(options.targets),
+        library=options.library,
+        physics=options.physics,
+    )
+    setup = compared.setup
     document = evaluate(
-        config,
+        setup.config,
         setup.robot,
         setup.library,
         setup.library_hash,
-        policies,
+        compared.policies,
         checkpoint=str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path),
-        targets=targets,
+        targets=compared.targets,
         episodes=options.episodes,
         seed=options.seed,
-        budget=budget,
+        budget={name: cost(info) for name, info in compared.info.items()},
     )
     closing(show_and_write(output, document), f"make unlearn ROBOT={options.robot}")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import io
+import math
 from collections.abc import Iterable, Iterator, Sequence
 
 import av
@@ -19,6 +20,7 @@ FPS = 25.0  # of a film
 PANE = (400, 400)  # width and height of one policy's pane, pixels
 HEADER = 36  # pixels above the panes
 FRONT_LEFT = 215.0  # degrees from the robot's heading at the start to the camera's gaze
+AFTER_END_SECONDS = 1.5  # shown once every policy's episode has ended
 SMOOTH_SECONDS = 0.25  # width of the Gaussian that smooths the camera's path
 LEAN = 0.5  # m, how far the camera looks from the robot towards the reference
 INK, PAPER, GREY = (28, 32, 38), (255, 255, 255), (110, 118, 128)
@@ -31,8 +33,23 @@ def pane_renderer(robot: str) -> Renderer:
     return Renderer(robot, *PANE)
 
 
+def shown_steps(episode: Episode, *, fps: float = FPS, seconds: float = math.inf) -> range:
+    """The steps of an episode that make its film: thinned to `fps`, and no longer than there is something to see.
+
+    Args:
+        episode: to be shown.
+        fps: pictures a second.
+        seconds: longest film.
+    """
+    last = len(episode.reference) - 1
+    ends = [take.ended for take in episode.takes.values() if take.ended is not None]
+    if len(ends) == len(episode.takes):
+        last = min(last, max(ends) + round(AFTER_END_SECONDS * episode.fps))
+    return range(0, int(min(last, seconds * episode.fps)) + 1, max(1, round(episode.fps / fps)))
+
+
 def render_clip(
-    renderer: Renderer, episode: Episode, *, target: bool = False, fps: float = FPS
+    renderer: Renderer, episode: Episode, *, target: bool = False, fps: float = FPS, seconds: float = math.inf
 ) -> Iterator[np.ndarray]:
     """The film of an episode, frame by frame.
 
@@ -41,40 +58,33 @@ def render_clip(
         episode: what `record` returned for one clip.
         target: the clip is one to be forgotten, and the header says so.
         fps: pictures a second; the episode's steps are thinned to it.
+        seconds: longest film; it ends sooner where every policy has.
 
     Yields:
         [height, width, 3] u8: a header, and below it one pane a policy.
     """
-    shown = range(0, len(episode.reference), max(1, round(episode.fps / fps)))
     paths = {name: _camera_path(take.qpos, episode.reference, episode.fps) for name, take in episode.takes.items()}
     azimuth = _heading_degrees(episode.reference[0]) + FRONT_LEFT
-    for step in shown:
-        panes = [
-            _pane(renderer, name, take, episode, step, paths[name][step], azimuth)
-            for name, take in episode.takes.items()
-        ]
-        frame = Image.new("RGB", (PANE[0] * len(panes), PANE[1] + HEADER), PAPER)
+    for step in shown_steps(episode, fps=fps, seconds=seconds):
+        frame = Image.new("RGB", (PANE[0] * len(episode.takes), PANE[1] + HEADER), PAPER)
         _header(frame, episode, target, step)
-        for column, pane in enumerate(panes):
+        for column, (name, take) in enumerate(episode.takes.items()):
+            pane = _pane(renderer, name, take, episode, step, paths[name][step], azimuth)
             frame.paste(pane, (column * PANE[0], HEADER))
         yield np.asarray(frame)
 
 
-def contact_sheet(rows: Sequence[tuple[Episode, Sequence[np.ndarray]]], *, pictures: int = 6) -> Image.Image:
-    """All clips on one page: a row a clip, `pictures` of its frames evenly spread.
+def stills(frames: Sequence[np.ndarray], count: int = 6) -> list[np.ndarray]:
+    """`count` frames of a film, evenly spread from the first to the last, at half the size."""
+    chosen = np.linspace(0, len(frames) - 1, count).round().astype(int)
+    return [np.asarray(Image.fromarray(frames[index]).reduce(2)) for index in chosen]
 
-    Args:
-        rows: episode and its film's frames.
-        pictures: a row.
-    """
-    width = max(frames[0].shape[1] for _, frames in rows) // 2
-    height = rows[0][1][0].shape[0] // 2
-    sheet = Image.new("RGB", (width * pictures, height * len(rows)), PAPER)
-    for row, (_, frames) in enumerate(rows):
-        for column, index in enumerate(np.linspace(0, len(frames) - 1, pictures).round().astype(int)):
-            small = Image.fromarray(frames[index]).reduce(2)
-            sheet.paste(small, (column * width, row * height))
-    return sheet
+
+def contact_sheet(rows: Sequence[Sequence[np.ndarray]]) -> bytes:
+    """A PNG with a row of pictures [height, width, 3] a clip; every row has as many, of the same size."""
+    buffer = io.BytesIO()
+    Image.fromarray(np.concatenate([np.concatenate(row, axis=1) for row in rows])).save(buffer, format="PNG")
+    return buffer.getvalue()
 
 
 def mp4(frames: Iterable[np.ndarray], fps: float = FPS) -> bytes:
@@ -121,6 +131,7 @@ def _pane(
     pen.rectangle([10, height - 20, width - 10, height - 12], fill=(255, 255, 255, 170))
     pen.rectangle([10, height - 20, 10 + (width - 20) * reward, height - 12], fill=(46, 140, 90, 255))
     pen.text((10, height - 26), text, font=_font(15), fill=INK, anchor="ls")
+    pen.rectangle([0, 0, width - 1, height - 1], outline=PAPER)
     if ended is not None:
         pen.rectangle([0, 0, width - 1, height - 1], outline=RED, width=BORDER)
         _chip(pen, (width - 10, 10), f"fell at {ended / episode.fps:.2f} s", RED, right=True)

@@ -115,7 +115,7 @@ def record(
     *,
     seed: int = 0,
 ) -> list[Episode]:
-    """One episode of each clip from its first frame on, for every policy.
+    """One episode of each clip from its first frame on, for every policy: those of an `Evaluator` with one a clip.
 
     Args:
         config: whose physics, rewards and bounds hold; the evaluation's changes to it are made here.
@@ -125,12 +125,13 @@ def record(
         clips: names of clips of the library.
         seed: of the reset noise.
     """
-    chosen = np.array([library.names.index(clip) for clip in clips])
-    stage = SideBySide(config, robot, library, policies, starts=len(chosen))
-    state = stage.begin(chosen, np.zeros_like(chosen), seed)
+    every = np.arange(len(library.names))  # the noise of a clip's start does not depend on which clips are chosen
+    chosen = [library.names.index(clip) for clip in clips]
+    stage = SideBySide(config, robot, library, policies, starts=len(every))
+    state = stage.begin(every, np.zeros_like(every), seed)
     horizon = np.asarray(state.horizon)
     poses, rewards, ended = [np.asarray(state.physics.qpos)], [], np.full(len(horizon), -1)
-    for step in range(int(horizon.max())):
+    for step in range(int(horizon[chosen].max())):
         state, result = stage.step(state)
         poses.append(np.asarray(state.physics.qpos))
         rewards.append(np.asarray(result.reward.normalized_tracking))
@@ -145,10 +146,10 @@ def record(
 
     return [
         Episode(
-            clip=name,
+            clip=library.names[clip],
             fps=1.0 / stage.env.control_step,
-            reference=reference_qpos(robot, library, clip)[: horizon[start] + 1],
-            takes={policy: take(i * len(chosen) + start) for i, policy in enumerate(stage.names)},
+            reference=reference_qpos(robot, library, clip)[: horizon[clip] + 1],
+            takes={policy: take(i * len(every) + clip) for i, policy in enumerate(stage.names)},
         )
-        for start, (name, clip) in enumerate(zip(clips, chosen, strict=True))
+        for clip in chosen
     ]

@@ -1,3 +1,4 @@
+import dataclasses
 import io
 
 import av
@@ -95,13 +96,25 @@ def test_a_gif_is_thinned_and_shrunk_and_keeps_time(frames):
     assert np.abs(np.asarray(image.convert("RGB"), int) - Image.fromarray(frames[0]).reduce(2)).mean() < 12.0
 
 
-def test_a_contact_sheet_has_a_row_a_clip(episodes, frames):
-    sheet = np.asarray(film.contact_sheet([(episodes[0], frames), (episodes[1], frames[:2])], pictures=3))
+def test_a_contact_sheet_has_a_row_a_clip(frames):
+    row = film.stills(frames, 3)
+    for still, index in zip(row, (0, 2, 4), strict=True):
+        np.testing.assert_array_equal(still, np.asarray(Image.fromarray(frames[index]).reduce(2)))
+    sheet = np.asarray(Image.open(io.BytesIO(film.contact_sheet([row, row[::-1]]))))
     height, width = frames[0].shape[0] // 2, frames[0].shape[1] // 2
     assert sheet.shape == (2 * height, 3 * width, 3)
-    for column, index in enumerate((0, 2, 4)):
-        expected = np.asarray(Image.fromarray(frames[index]).reduce(2))
-        np.testing.assert_array_equal(sheet[:height, column * width : (column + 1) * width], expected)
+    np.testing.assert_array_equal(sheet[height:, :width], row[2])
+
+
+def test_a_film_ends_when_there_is_nothing_more_to_see(robot):
+    steps = film.shown_steps
+    assert list(steps(standing(robot), fps=10.0)) == list(range(0, 51, 5))
+    assert steps(standing(robot), fps=50.0, seconds=0.5)[-1] == 25
+    long = standing(robot, ended=20)
+    long = dataclasses.replace(long, reference=np.tile(long.reference, (10, 1)))
+    assert steps(long, fps=50.0)[-1] == 20 + 75, "1.5 s after the last policy ended"
+    both = dataclasses.replace(long, takes={**long.takes, "other": standing(robot).takes["base"]})
+    assert steps(both, fps=50.0)[-1] == 509
 
 
 def test_a_robot_without_shapes_to_be_seen_is_drawn_by_those_it_collides_with(robot, monkeypatch):

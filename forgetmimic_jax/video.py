@@ -1,0 +1,110 @@
+"""Film what a policy does clip by clip: `python -m forgetmimic_jax.video --robot g1`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from forgetmimic_jax.errors import InputError, nearest, run_command
+from forgetmimic_jax.options import at_least, comma_separated, parse
+
+if TYPE_CHECKING:
+    from forgetmimic_jax.viewing.side_by_side import Episode
+
+
+@dataclass
+class Options:
+    """Film one episode of each clip, base beside unlearned policy, and put stills of all clips on one page.
+
+    The episodes start at the clips' first frames and follow the evaluation's protocol on MuJoCo's C engine.
+    """
+
+    robot: str = "g1"
+    """Robot under robots/."""
+    checkpoint: Path | None = None
+    """Checkpoint folder, such as an unlearning run's; the shipped base data/ROBOT/base by default."""
+    base: Path | None = None
+    """For an unlearned checkpoint, the base beside it; the one it started from by default."""
+    clips: str | None = None
+    """Clips to film, comma-separated; all of the library by default."""
+    seconds: float = 10.0
+    """Longest film, s; a film ends sooner where the clip does, or once every policy has fallen."""
+    seed: int = 0
+    """Seed of the reset noise; the same for every policy."""
+    library: Path | None = None
+    """Folder of clips; the checkpoint's by default."""
+    output: Path | None = None
+    """Folder for the films; videos/ in the checkpoint's run, or runs/video-ROBOT."""
+
+
+def main(options: Options) -> None:
+    """Record the episodes, draw and write the films, and print how the policies did in them."""
+    from rich.console import Console
+
+    from forgetmimic_jax import runner
+    from forgetmimic_jax.comparison import load_comparison
+    from forgetmimic_jax.console import closing, progress
+    from forgetmimic_jax.motion.clip import write_atomically
+    from forgetmimic_jax.viewing import film
+    from forgetmimic_jax.viewing.offscreen import check_rendering
+    from forgetmimic_jax.viewing.side_by_side import record
+
+    at_least(0, "--seed", options.seed)
+    if not options.seconds > 0:
+        raise InputError(f"--seconds: found {options.seconds:g}; accepted: above 0")
+    path = options.checkpoint or runner.base_folder(options.robot)
+    run = runner.folder_of(path)
+    output = options.output or (run / "videos" if run else Path("runs") / f"video-{options.robot}")
+    runner.check_writable(output)
+    compared = load_comparison(path, robot=options.robot, base=options.base, library=options.library, physics="native")
+    setup = compared.setup
+    clips = setup.library.names if options.clips is None else comma_separated(options.clips)
+    if not clips:
+        raise InputError("--clips: no clip named; leave the flag out for all of them")
+    for clip in clips:
+        if clip not in setup.library.names:
+            raise InputError(f"--clips: no clip '{clip}' in the library; {nearest(clip, setup.library.names)}")
+    check_rendering()
+    episodes = record(setup.config, setup.robot, setup.library, compared.policies, clips, seed=options.seed)
+    output.mkdir(parents=True, exist_ok=True)
+    sheet, drawn = [], 0
+    total = sum(len(film.shown_steps(episode, seconds=options.seconds)) for episode in episodes)
+    with film.pane_renderer(options.robot) as renderer, progress("draw", total) as report:
+        for episode in episodes:
+            frames = []
+            target = episode.clip in compared.targets
+            for frame in film.render_clip(renderer, episode, target=target, seconds=options.seconds):
+                frames.append(frame)
+                drawn += 1
+                report(drawn, 0, {})
+            write_atomically(output / f"{episode.clip}.mp4", film.mp4(frames))
+            write_atomically(output / f"{episode.clip}.gif", film.gif(frames))
+            sheet.append(film.stills(frames))
+    write_atomically(output / "contact_sheet.png", film.contact_sheet(sheet))
+    Console().print(_table(episodes, compared.targets))
+    chosen = f" CHECKPOINT={path}" if options.checkpoint else ""
+    files = {"films": output / "*.mp4", "for pages": output / "*.gif", "all clips": output / "contact_sheet.png"}
+    closing(files, f"make play ROBOT={options.robot}{chosen}")
+
+
+def _table(episodes: Sequence[Episode], targets: Sequence[str]):
+    """What happened in each film."""
+    from rich import box
+    from rich.table import Table
+
+    table = Table(title="One episode a clip", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    for column in ("clip", "role", *(f"{name}: tracking" for name in episodes[0].takes)):
+        table.add_column(column, justify="left" if column in ("clip", "role") else "right")
+    for episode in episodes:
+        cells = []
+        for take in episode.takes.values():
+            fell = "" if take.ended is None else f", fell at {take.ended / episode.fps:.2f} s"
+            cells.append(f"{take.survival_weighted_tracking:.2f}{fell}")
+        table.add_row(episode.clip, "target" if episode.clip in targets else "kept", *cells)
+    return table
+
+
+if __name__ == "__main__":
+    run_command(lambda: main(parse(Options, "video")))
