@@ -67,6 +67,11 @@ def init_policy(config: Config, num_joints: int, actor_size: int, critic_size: i
     )
 
 
+def initial_failure_level(config: Config, assets: Assets) -> Array:
+    """L [clip, bin] before anything was tried."""
+    return jnp.where(assets.bins.valid, jnp.float32(config.sampling.initial_failure), 0.0)
+
+
 def mean_action(policy: Policy, config: Config, observation: Array) -> Array:
     """The deterministic action [..., joint] at an actor observation [..., features] as the environment gives it."""
     actor = make_actor(config, policy.actor["params"]["log_std"].size)
@@ -88,7 +93,7 @@ def init_state(
     config = env.config
     state_key, policy_key, start_key, episode_key = jax.random.split(key, 4)
     if failure_level is None:
-        failure_level = jnp.where(assets.bins.valid, jnp.float32(config.sampling.initial_failure), 0.0)
+        failure_level = initial_failure_level(config, assets)
     zeros = jnp.zeros((env.num_envs,), jnp.int32)
     episodes = start_episodes(env, assets, episode_key, zeros, zeros, zeros, zeros.astype(jnp.float32))
     probabilities = bin_probabilities(config.sampling, assets.bins, failure_level)

@@ -114,12 +114,14 @@ class OnnxActor:
             )
         except Exception as error:  # onnxruntime has a type of its own for each trouble
             raise InputError(f"{source!s:.200}: not a readable ONNX model: {str(error).splitlines()[0]}") from None
+        # A tracking policy of mjlab also takes the time step of the motion it holds, which no action depends on.
+        others = [value for value in self._session.get_inputs() if value.name != INPUT]
+        self._feed = {value.name: np.zeros([1] * len(value.shape), np.float32) for value in others}
         self.metadata: dict[str, str] = self._session.get_modelmeta().custom_metadata_map
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """Mean action f32[joint] at an observation [features]."""
-        feed: dict[str, Any] = {INPUT: observation[None].astype(np.float32)}
-        return self._session.run([OUTPUT], feed)[0][0]
+        return self._session.run([OUTPUT], self._feed | {INPUT: observation[None].astype(np.float32)})[0][0]
 
     def numbers(self, key: str) -> np.ndarray:
         """A metadata list of numbers."""

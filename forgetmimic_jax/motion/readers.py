@@ -144,8 +144,8 @@ def read_npz(
 def read_gmr(robot: Robot, path: Path, fps: float | None = None, quaternion_order: str = "auto") -> Clip:
     """GMR's pickle: fps, root_pos, root_rot (xyzw), dof_pos in the robot's order. Only numbers are unpickled."""
     try:
-        content = _NumbersOnly(io.BytesIO(path.read_bytes())).load()
-    except _Refused as error:
+        content = NumbersOnly(io.BytesIO(path.read_bytes())).load()
+    except Refused as error:
         raise InputError(
             f"{path}: refused: the pickle would call {error}; accepted: numpy arrays and numbers"
         ) from None
@@ -167,11 +167,11 @@ def read_gmr(robot: Robot, path: Path, fps: float | None = None, quaternion_orde
     return Clip(path.stem, rate, robot.joint_names, arrays["root_pos"], quat, arrays["dof_pos"])
 
 
-class _Refused(Exception):
+class Refused(Exception):
     """A pickle names something other than numpy's reconstruction."""
 
 
-class _NumbersOnly(pickle.Unpickler):
+class NumbersOnly(pickle.Unpickler):
     """An unpickler that can build numpy arrays, scalars and plain containers, and call nothing else."""
 
     ALLOWED = frozenset(
@@ -189,7 +189,7 @@ class _NumbersOnly(pickle.Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in self.ALLOWED:
-            raise _Refused(f"{module}.{name}")
+            raise Refused(f"{module}.{name}")
         return super().find_class(module.replace("numpy.core", "numpy._core"), name)
 
 

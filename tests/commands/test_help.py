@@ -7,7 +7,10 @@ import pytest
 from forgetmimic_jax.options import parse
 
 
-@pytest.mark.parametrize("command", ["train", "unlearn", "evaluate", "bench", "export", "video"])
+COMMANDS = ["train", "unlearn", "evaluate", "bench", "export", "importers", "video"]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
 def test_help_lists_every_option_with_its_default(command, capsys):
     options = importlib.import_module(f"forgetmimic_jax.{command}").Options
     with pytest.raises(SystemExit) as exit_:
