@@ -6,7 +6,6 @@ import pytest
 
 from forgetmimic_jax.options import parse
 
-
 COMMANDS = ["train", "unlearn", "evaluate", "bench", "export", "importers", "video"]
 
 
