@@ -68,7 +68,8 @@ def save_checkpoint(
         robot: the robot trained.
         library: the clips trained on.
         library_hash: of those clips.
-        environment_steps: control steps lived so far, all environments together.
+        environment_steps: control steps lived so far, all environments together, with those of the base that
+            training went on from.
         resumable: with `run/`; without, the checkpoint is small and serves evaluation and warm starts only.
 
     Raises:

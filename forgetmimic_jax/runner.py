@@ -223,7 +223,7 @@ def run(
     config = setup.config
     newest = prepare_folder(directory, resume=resume)
     if newest is None:
-        state, environment_steps = start_state(setup), 0
+        state, environment_steps = start_state(setup), _steps_before(config)
     else:
         state, environment_steps = _saved_state(setup, newest)
     iteration = int(state.iteration)
@@ -295,6 +295,13 @@ def _watch(setup: Setup, directory: Path, iteration: int) -> Watch | None:
     if not setup.config.evaluate_every:
         return None
     return Watch(setup.config, setup.robot, setup.library, directory, iteration)
+
+
+def _steps_before(config: Config) -> int:
+    """Environment steps that a base's training adds to those of the training that goes on from it."""
+    if config.base is None or config.unlearn.targets:
+        return 0
+    return checkpoint.read_info(Path(config.base)).environment_steps
 
 
 def _saved_state(setup: Setup, path: Path) -> tuple[TrainState, int]:

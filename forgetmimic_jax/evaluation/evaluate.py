@@ -55,7 +55,7 @@ def evaluate(
 
 def cost(info: CheckpointInfo) -> dict[str, float]:
     """What a checkpoint's training cost."""
-    return {"iterations": info.iteration, "environment_steps": info.environment_steps}
+    return {"environment_steps": info.environment_steps}
 
 
 def show_and_write(directory: Path, document: dict[str, Any]) -> dict[str, Path]:

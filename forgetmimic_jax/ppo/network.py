@@ -41,7 +41,16 @@ class Actor(nn.Module):
     def __call__(self, observation: Array) -> tuple[Array, Array]:
         mean = MLP(self.layers, self.actions, output_scale=0.01)(observation)
         log_std = self.param("log_std", nn.initializers.constant(jnp.log(self.initial_std)), (self.actions,))
-        return mean, jnp.clip(log_std, jnp.log(MIN_STD), jnp.log(MAX_STD))
+        return mean, log_std
+
+
+def bound_std(parameters: Any) -> Any:
+    """Actor parameters with the standard deviation in [MIN_STD, MAX_STD].
+
+    After a gradient step, not inside the network: there a clip would leave what lies outside without a gradient back.
+    """
+    log_std = jnp.clip(parameters["params"]["log_std"], jnp.log(MIN_STD), jnp.log(MAX_STD))
+    return {**parameters, "params": {**parameters["params"], "log_std": log_std}}
 
 
 class Critic(nn.Module):

@@ -18,7 +18,7 @@ from forgetmimic_jax.config import PPOConfig
 from forgetmimic_jax.ppo import network
 from forgetmimic_jax.ppo.gae import generalized_advantages
 from forgetmimic_jax.ppo.loss import Batch, Prediction, adapt_learning_rate
-from forgetmimic_jax.ppo.network import kl_divergence, log_prob, normalize, update_normalizer
+from forgetmimic_jax.ppo.network import bound_std, kl_divergence, log_prob, normalize, update_normalizer
 from forgetmimic_jax.state import Policy, TrainState, make_actor, make_critic, make_optimizer
 from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.tracking.env import Assets, Environment
@@ -209,7 +209,8 @@ def improve(
             )
         metrics["gradient_norm"] = optax.tree.norm(gradient)
         updates, optimizer_state = optimizer.update(gradient, optimizer_state)
-        params = jax.tree.map(lambda p, u: p - learning_rate * u, params, updates)
+        actor_parameters, critic_parameters = jax.tree.map(lambda p, u: p - learning_rate * u, params, updates)
+        params = (bound_std(actor_parameters), critic_parameters)
         return (params, optimizer_state, learning_rate), metrics
 
     def epoch(carry, key: Array):

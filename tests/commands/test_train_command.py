@@ -114,6 +114,12 @@ def test_training_may_go_on_from_a_base_with_other_clips(base_run, tmp_path, lib
     assert state.failure_level.shape[0] == 2
 
 
+def test_what_a_base_lived_counts_for_the_training_that_goes_on_from_it(base_run, tmp_path, options):
+    further = finished(train.main, options(output=tmp_path / "run", base=base_run.checkpoint(4), iterations=2))
+    assert [row["environment_steps"] for row in further.rows] == [(4 + 2) * 8 * 4]
+    assert checkpoint.read_info(further.checkpoint(2)).environment_steps == (4 + 2) * 8 * 4
+
+
 def test_settings_given_twice_add_up():
     options = parse(train.Options, "train", ["--set", "ppo.num_envs=8", "seed=1", "--set", "iterations=3"])
     assert [*itertools.chain(*options.set)] == ["ppo.num_envs=8", "seed=1", "iterations=3"]

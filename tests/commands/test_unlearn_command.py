@@ -81,8 +81,8 @@ def test_the_evaluation_has_the_documented_form(base_run, unlearned_run):
         "episodes": 3,
         "targets": ["turn"],
         "budget": {
-            "base": {"iterations": 4, "environment_steps": 128},
-            "unlearned": {"iterations": 2, "environment_steps": 64},
+            "base": {"environment_steps": 128},
+            "unlearned": {"environment_steps": 64},
         },
     }
     assert policies.keys() == {"base", "unlearned", "zero_action"}

@@ -8,6 +8,7 @@ from forgetmimic_jax.ppo.network import (
     Actor,
     Critic,
     Normalizer,
+    bound_std,
     distribution,
     entropy,
     init_normalizer,
@@ -49,6 +50,16 @@ def test_the_standard_deviation_is_one_number_per_action_and_sees_no_observation
     parameters = actor.init(KEY, jnp.zeros((1, 7)))
     log_std = distribution(actor, parameters, jax.random.normal(KEY, (5, 7)))[1]
     np.testing.assert_allclose(np.exp(log_std), [initial_std] * 3, rtol=1e-6)
+
+
+def test_a_standard_deviation_past_its_bound_comes_back_to_it_and_keeps_its_gradient():
+    actor = Actor((8,), 3, 1.0)
+    parameters = actor.init(KEY, jnp.zeros((1, 7)))
+    parameters["params"]["log_std"] = jnp.log(jnp.array([0.01, 0.5, 9.0]))
+    bounded = bound_std(parameters)
+    np.testing.assert_allclose(np.exp(bounded["params"]["log_std"]), [0.05, 0.5, 2.0], rtol=1e-6)
+    gradient = jax.grad(lambda p: distribution(actor, p, jnp.zeros((1, 7)))[1].sum())(bounded)
+    np.testing.assert_array_equal(gradient["params"]["log_std"], [1.0, 1.0, 1.0])
 
 
 def test_the_first_policy_is_almost_the_zero_action():
