@@ -129,6 +129,9 @@ class PPOConfig:
     """Proximal policy optimisation (paper, appendix 'PPO Hyperparameters')."""
 
     num_envs: int = 4096
+    branches: int = (
+        1  # environments that set out from one state in every iteration, each other's baseline; 1: plain PPO
+    )
     num_steps: int = 24  # control steps per environment per iteration
     epochs: int = 5
     minibatches: int = 4
@@ -267,6 +270,8 @@ def validate(config: Config) -> None:
             f"ppo.minibatches: found {ppo.minibatches}; accepted: 1 to num_envs × num_steps = "
             f"{ppo.num_envs * ppo.num_steps}"
         )
+    if ppo.num_envs % ppo.branches:
+        raise InputError(f"ppo.branches: found {ppo.branches}; accepted: a divisor of num_envs = {ppo.num_envs}")
 
 
 def _numbers(content: Any, name: str = "") -> Iterator[tuple[str, int | float]]:

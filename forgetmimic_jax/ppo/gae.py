@@ -37,3 +37,22 @@ def generalized_advantages(
 
     _, advantage = jax.lax.scan(backward, jnp.zeros_like(delta[0]), (delta, carry_on), reverse=True)
     return advantage, advantage + value
+
+
+def centre_branches(advantage: Array, done: Array, branches: int) -> Array:
+    """Advantages [time, env] less the mean of the other branches' at the same time: the critic's common error cancels.
+
+    Branches are consecutive environments that were in the same state at time 0, as in the vine of TRPO (Schulman et al.
+    2015). A branch whose episode has ended has left the others, and is neither compared nor a baseline any more. The
+    baseline depends on no action of its own branch, which leaves the policy gradient unbiased.
+
+    Args:
+        advantage: [time, env].
+        done: bool[time, env] the episode ends here.
+        branches: how many share a state; divides the number of environments.
+    """
+    together = ((jnp.cumsum(done, axis=0) - done) == 0).reshape(len(done), -1, branches)
+    grouped = advantage.reshape(together.shape)
+    others = together.sum(-1, keepdims=True) - 1
+    mean = (jnp.where(together, grouped, 0.0).sum(-1, keepdims=True) - grouped) / jnp.maximum(others, 1)
+    return jnp.where(together & (others > 0), grouped - mean, grouped).reshape(advantage.shape)

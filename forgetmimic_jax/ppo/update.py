@@ -16,7 +16,7 @@ from jax import Array
 
 from forgetmimic_jax.config import PPOConfig
 from forgetmimic_jax.ppo import network
-from forgetmimic_jax.ppo.gae import generalized_advantages
+from forgetmimic_jax.ppo.gae import centre_branches, generalized_advantages
 from forgetmimic_jax.ppo.loss import Batch, Prediction, adapt_learning_rate
 from forgetmimic_jax.ppo.network import bound_std, kl_divergence, log_prob, normalize, update_normalizer
 from forgetmimic_jax.state import Policy, TrainState, make_actor, make_critic, make_optimizer
@@ -73,6 +73,9 @@ def make_iteration(env: Environment) -> Callable[[Assets, TrainState], tuple[Tra
             env.config.ppo.discount,
             env.config.ppo.gae_lambda,
         )
+        if env.config.ppo.branches > 1:
+            done = trajectory.terminated | trajectory.truncated
+            advantage = centre_branches(advantage, done, env.config.ppo.branches)
         state, losses = improve(env, assets, state, trajectory, advantage, target)
         return learn_sampler(env, assets, state, trajectory, losses)
 
@@ -80,7 +83,10 @@ def make_iteration(env: Environment) -> Callable[[Assets, TrainState], tuple[Tra
 
 
 def collect(env: Environment, assets: Assets, state: TrainState) -> tuple[TrainState, Trajectory]:
-    """`num_steps` control steps of every environment with the current policy."""
+    """`num_steps` control steps of every environment with the current policy.
+
+    With `branches`, the first of every group of environments lends the others its state to set out from.
+    """
     config, policy, method = env.config, state.policy, method_of(env.config)
     actor, critic = make_actor(config, env.robot.num_joints), make_critic(config)
     probabilities = bin_probabilities(config.sampling, assets.bins, state.failure_level)
@@ -130,7 +136,9 @@ def collect(env: Environment, assets: Assets, state: TrainState) -> tuple[TrainS
 
     key, first_key, rollout_key = jax.random.split(state.key, 3)
     keys = jax.random.split(rollout_key, config.ppo.num_steps)
-    (episodes, _, _), trajectory = jax.lax.scan(one_step, (state.env, *observe(state.env, first_key)), keys)
+    leader = jnp.arange(env.num_envs) // config.ppo.branches * config.ppo.branches
+    start = jax.tree.map(lambda x: x[leader], state.env) if config.ppo.branches > 1 else state.env
+    (episodes, _, _), trajectory = jax.lax.scan(one_step, (start, *observe(start, first_key)), keys)
     return dataclasses.replace(state, env=episodes, key=key), trajectory
 
 

@@ -2,7 +2,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from forgetmimic_jax.ppo.gae import generalized_advantages
+from forgetmimic_jax.ppo.gae import centre_branches, generalized_advantages
 
 
 def by_loops(reward, value, next_value, terminated, truncated, discount, gae_lambda) -> np.ndarray:
@@ -77,3 +77,29 @@ def test_advantages_equal_the_sum_over_each_episode(seed):
     expected = by_loops(reward, value, next_value, terminated, truncated, 0.99, 0.95)
     np.testing.assert_allclose(advantage, expected, atol=1e-5)
     np.testing.assert_allclose(target, expected + value, atol=1e-5)
+
+
+def test_branches_are_measured_against_each_other():
+    advantage = jnp.array([[1.0, 4.0, 10.0, 0.0]])
+    centred = centre_branches(advantage, jnp.zeros((1, 4), bool), 2)
+    np.testing.assert_allclose(centred, [[-3.0, 3.0, 10.0, -10.0]])
+    centred = centre_branches(advantage, jnp.zeros((1, 4), bool), 4)
+    np.testing.assert_allclose(centred, [[1 - 14 / 3, 4 - 11 / 3, 10 - 5 / 3, 0 - 5]], rtol=1e-6)
+
+
+def test_a_branch_whose_episode_ended_is_left_alone():
+    advantage = jnp.array([[1.0, 4.0, 7.0], [1.0, 4.0, 7.0], [1.0, 4.0, 7.0]])
+    done = jnp.array([[False, True, False], [False, False, False], [True, False, False]])
+    expected = [[1 - 5.5, 4 - 4.0, 7 - 2.5], [1 - 7.0, 4.0, 7 - 1.0], [1 - 7.0, 4.0, 7 - 1.0]]
+    np.testing.assert_allclose(centre_branches(advantage, done, 3), expected)
+
+
+def test_what_the_critic_gets_wrong_of_a_shared_state_cancels():
+    rng = np.random.default_rng(0)
+    advantage, error = rng.standard_normal((3, 8)), np.repeat(rng.standard_normal((3, 2)), 4, axis=1)
+    done = jnp.zeros((3, 8), bool)
+    np.testing.assert_allclose(
+        centre_branches(jnp.asarray(advantage + error), done, 4),
+        centre_branches(jnp.asarray(advantage), done, 4),
+        atol=1e-5,
+    )

@@ -136,6 +136,16 @@ def test_collected_actions_have_the_density_of_the_policy(run, trajectory):
     assert (trajectory.action - trajectory.mean).std() == pytest.approx(std, rel=0.1)
 
 
+def test_branches_set_out_from_their_leaders_state_and_part(run):
+    ppo = dataclasses.replace(run.env.config.ppo, branches=4)
+    env = dataclasses.replace(run.env, config=dataclasses.replace(run.env.config, ppo=ppo))
+    state = run.start()
+    seen = jax.jit(lambda assets, state: collect(env, assets, state))(run.assets, state)[1].critic_observation
+    alone = run.collect(run.assets, run.start())[1].critic_observation
+    np.testing.assert_allclose(seen[0], np.asarray(alone[0])[[0, 0, 0, 0, 4, 4, 4, 4]], atol=1e-5)
+    assert len(np.unique(seen[1], axis=0)) == ENVS
+
+
 def test_the_value_of_the_state_reached_is_the_next_steps_value_until_the_episode_ends(trajectory):
     goes_on = ~(trajectory.terminated | trajectory.truncated)[:-1]
     np.testing.assert_allclose(trajectory.next_value[:-1][goes_on], trajectory.value[1:][goes_on], atol=1e-4)
