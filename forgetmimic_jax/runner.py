@@ -217,8 +217,8 @@ def run(
 
     The folder gets config.yaml, metrics.jsonl (means over LOG_EVERY iterations), TensorBoard events and checkpoints/,
     the first of them before the first iteration, so that a run that is killed can always go on. With
-    `config.evaluate_every` also evaluations.jsonl and best/, the policy with the best mean survival-weighted tracking.
-    Ctrl-C and SIGTERM end the current iteration, save, and raise Interrupted.
+    `config.evaluate_every` also evaluations.jsonl, its picture evaluations.png, and best/, the policy with the best
+    mean survival-weighted tracking. Ctrl-C and SIGTERM end the current iteration, save, and raise Interrupted.
     """
     config = setup.config
     newest = prepare_folder(directory, resume=resume)

@@ -60,7 +60,9 @@ def main(options: Options) -> None:
     setup = runner.make_setup(on_engine(config, options.physics))
     path, _ = runner.run(setup, output, description=f"train {config.robot}", resume=options.resume)
     best = output / runner.BEST
-    files = {"checkpoint": path} | ({"best policy": best} if best.is_dir() else {})
+    files = {"checkpoint": path}
+    if best.is_dir():
+        files |= {"best policy": best, "clips over time": output / "evaluations.png"}
     files |= {"curves": output / "metrics.jsonl", "TensorBoard": output / "events"}
     closing(files, f"make evaluate ROBOT={config.robot} CHECKPOINT={files.get('best policy', path)}")
 

@@ -166,6 +166,7 @@ def test_the_best_policy_is_kept_too_also_over_a_resume(run, skill):
     skill += [0.25, 0.5, 0.375]
     run(evaluate_every=10, iterations=30)
     assert evaluations() == {10: 0.25, 20: 0.5, 30: 0.375}
+    assert (run.folder / "evaluations.png").stat().st_size > 0
     best = run.folder / "best"
     assert checkpoint.read_info(best).iteration == 20
     assert not (best / "run").exists()

@@ -72,6 +72,26 @@ def training_curves(metrics_file: Path, path: Path, *, keys: Sequence[str] | Non
     _save(figure, path)
 
 
+def clips_over_time(evaluations_file: Path, path: Path) -> None:
+    """One panel a clip of a run's evaluations.jsonl: success and tracking over environment steps; a PNG."""
+    rows = read_rows(evaluations_file)
+    steps = [row["environment_steps"] / 1e6 for row in rows]
+    clips = list(rows[0]["clips"])
+    columns = min(4, len(clips))
+    lines = -(-len(clips) // columns)
+    figure = _figure(width=3.0 * columns, height=2.0 * lines)
+    for panel, clip in enumerate(clips):
+        axes = figure.add_subplot(lines, columns, panel + 1)
+        for metric, marker in (("success_rate", "o"), ("survival_weighted_tracking", "s")):
+            values = [row["clips"][clip][metric] for row in rows]
+            axes.plot(steps, values, marker=marker, markersize=3, label=metric.replace("_", " "))
+        axes.set_ylim(-0.03, 1.03)
+        axes.set_title(clip, fontsize="small")
+    figure.axes[0].legend(fontsize="x-small")
+    figure.supxlabel("environment steps (millions)", fontsize="small")
+    _save(figure, path)
+
+
 def _figure(*, width: float, height: float) -> Figure:
     from matplotlib.figure import Figure
 

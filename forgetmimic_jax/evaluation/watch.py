@@ -8,6 +8,7 @@ from typing import Any
 
 from forgetmimic_jax.config import Config
 from forgetmimic_jax.evaluation.metrics import episode_metrics
+from forgetmimic_jax.evaluation.plots import clips_over_time
 from forgetmimic_jax.evaluation.rollout import Evaluator
 from forgetmimic_jax.motion.library import MotionLibrary
 from forgetmimic_jax.robot import Robot
@@ -20,7 +21,7 @@ SHOWN = ("success_rate", "survival_weighted_tracking")
 
 
 class Watch:
-    """Evaluates a run's policy on the same few episodes each time; one row of evaluations.jsonl a time."""
+    """Evaluates a run's policy on the same few episodes each time: a row of evaluations.jsonl, and its PNG."""
 
     def __init__(self, config: Config, robot: Robot, library: MotionLibrary, directory: Path, iteration: int):
         self._evaluator = Evaluator(config, robot, library, episodes=EPISODES, seed=config.seed)
@@ -41,6 +42,7 @@ class Watch:
         }
         with self._path.open("a") as file:
             file.write(json.dumps(row) + "\n")
+        clips_over_time(self._path, self._path.with_suffix(".png"))
         better = row["survival_weighted_tracking"] > self._best
         self._best = max(self._best, row["survival_weighted_tracking"])
         return better

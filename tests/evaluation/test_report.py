@@ -7,6 +7,7 @@ import pytest
 from rich.console import Console
 
 from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.evaluation import plots
 from forgetmimic_jax.evaluation.plots import clip_bars, training_curves
 from forgetmimic_jax.evaluation.report import evaluate_policies, evaluation_document, render_table, write_evaluation
 from forgetmimic_jax.evaluation.tables import fill, markdown_tables
@@ -166,3 +167,24 @@ def test_figures_are_written(tmp_path, document):
         assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
     with pytest.raises(InputError, match="no loss in its lines"):
         training_curves(curves, tmp_path / "other.png", keys=["loss"])
+
+
+def test_a_runs_clips_are_drawn_over_its_environment_steps(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(plots, "_save", lambda figure, path: drawn.append(figure))
+    rows = [
+        {
+            "environment_steps": 1_000_000 * (i + 1),
+            "clips": {
+                clip: {"success_rate": rate * i, "survival_weighted_tracking": 0.5 * rate * i}
+                for clip, rate in (("walk", 0.5), ("spin", 0.25))
+            },
+        }
+        for i in range(3)
+    ]
+    evaluations = tmp_path / "evaluations.jsonl"
+    evaluations.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    plots.clips_over_time(evaluations, tmp_path / "evaluations.png")
+    panels = {axes.get_title(): [line.get_xydata().tolist() for line in axes.lines] for axes in drawn[0].axes}
+    assert panels["walk"] == [[[1, 0], [2, 0.5], [3, 1.0]], [[1, 0], [2, 0.25], [3, 0.5]]]
+    assert panels["spin"][0] == [[1, 0], [2, 0.25], [3, 0.5]]
