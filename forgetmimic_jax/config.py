@@ -106,6 +106,7 @@ class SamplingConfig:
     bin_seconds: float = 4.0
     smoothing: float = 0.005  # α per episode
     uniform_ratio: float = 0.15  # ρ
+    prior: Literal["bins", "clips"] = "bins"  # clips: short clips weigh as much as long ones, whatever their bins
     initial_failure: float = 1.0
     failure_signal: Literal["survival_weighted", "alive_mean"] = "survival_weighted"
     clips: Literal["all", "kept"] = "all"  # kept: no episode of a clip to forget

@@ -52,20 +52,19 @@ def make_bins(library: MotionLibrary, bin_seconds: float, control_step: float) -
 def bin_probabilities(config: SamplingConfig, bins: Bins, failure_level: Array) -> Array:
     """p [clip, bin] of starting in each bin.
 
-    adaptive and frozen: p = (1 − ρ) softmax(L/τ) + ρ/N_valid with τ = 1/ln(1 + N_valid); frozen differs only in that
-    L is no longer updated. uniform_bins: 1/N_valid. uniform_clips: a clip uniformly, then a frame uniformly.
+    adaptive and frozen: p = (1 − ρ) softmax(L/τ + ln p0) + ρ p0 with τ = 1/ln(1 + N_valid); frozen differs only in that
+    L is no longer updated. The prior p0 is the paper's 1/N_valid, or with `prior` clips the same for every clip. uniform_bins: 1/N_valid. uniform_clips: a clip uniformly, then a frame uniformly.
     """
     count = bins.valid.sum()
     if config.rule == "uniform_clips":
         frames = jnp.where(bins.valid, bins.end - bins.start, 0)
         return frames / jnp.maximum(frames.sum(-1, keepdims=True), 1) / bins.valid.any(-1).sum()
-    uniform = bins.valid / count
     if config.rule == "uniform_bins":
-        return uniform
-    temperature = 1.0 / jnp.log1p(count)
-    logits = jnp.where(bins.valid, failure_level / temperature, -jnp.inf)
-    softmax = jax.nn.softmax(logits.reshape(-1)).reshape(logits.shape)
-    return (1.0 - config.uniform_ratio) * softmax + config.uniform_ratio * uniform
+        return bins.valid / count
+    weight = bins.valid / (jnp.maximum(bins.valid.sum(-1, keepdims=True), 1) if config.prior == "clips" else 1)
+    prior = weight / weight.sum()
+    favoured = prior * jnp.exp((failure_level - 1.0) * jnp.log1p(count))
+    return (1.0 - config.uniform_ratio) * favoured / favoured.sum() + config.uniform_ratio * prior
 
 
 def sample_start(key: Array, probabilities: Array, bins: Bins, num: int) -> tuple[Array, Array, Array]:

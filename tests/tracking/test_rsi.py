@@ -72,6 +72,13 @@ def test_adaptive_probabilities_by_hand(rule):
     np.testing.assert_allclose(bin_probabilities(SamplingConfig(rule=rule), bins, level), expected, rtol=1e-5)
 
 
+def test_a_prior_over_clips_does_not_favour_the_clip_of_many_bins():
+    config = SamplingConfig(prior="clips", uniform_ratio=0.2)
+    level = jnp.array([[0.5, 0.9], [0.0, 1.0]])  # as above: 4^L times the prior (1/2 and 1/4, 1/4)
+    expected = 0.8 * np.array([[1.0, 0.0], [0.25, 1.0]]) / 2.25 + 0.2 * np.array([[0.5, 0], [0.25, 0.25]])
+    np.testing.assert_allclose(bin_probabilities(config, bins_of([11, 21], 10), level), expected, rtol=1e-5)
+
+
 def test_uniform_bins_gives_every_bin_the_same():
     bins = bins_of([11, 21], 10)
     expected = np.array([[1, 0], [1, 1]]) / 3.0
