@@ -53,7 +53,8 @@ def bin_probabilities(config: SamplingConfig, bins: Bins, failure_level: Array) 
     """p [clip, bin] of starting in each bin.
 
     adaptive and frozen: p = (1 − ρ) softmax(L/τ + ln p0) + ρ p0 with τ = 1/ln(1 + N_valid); frozen differs only in that
-    L is no longer updated. The prior p0 is the paper's 1/N_valid, or with `prior` clips the same for every clip. uniform_bins: 1/N_valid. uniform_clips: a clip uniformly, then a frame uniformly.
+    L is no longer updated. The prior p0 is the paper's 1/N_valid, or with `prior` clips the same for every clip.
+    uniform_bins: 1/N_valid. uniform_clips: a clip uniformly, then a frame uniformly.
     """
     count = bins.valid.sum()
     if config.rule == "uniform_clips":
