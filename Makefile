@@ -17,6 +17,7 @@
 ## EPISODES     episodes a clip in an evaluation (default: 20)
 ## OUTPUT       folder for the results (default: a folder under runs/)
 ## RESUME       1 goes on with the run in OUTPUT
+## SWEEP        lambda, targets, sampler or seeds (default: lambda)
 ## ARGS         any other flags, as they are; ARGS=--help lists them
 ## PYTHON       the Python that .venv is made from, 3.11 to 3.13 (default: the first found)
 ROBOT ?= g1
@@ -28,10 +29,13 @@ RUN_FLAGS = $(ROBOT_FLAGS) $(call flag,seed,SEED) $(call flag,output,OUTPUT)
 TRAIN_FLAGS = $(RUN_FLAGS) $(call flag,preset,PRESET) $(call flag,iterations,ITERATIONS) $(call flag,base,BASE) \
 	$(if $(RESUME),--resume)
 TARGET_FLAGS = $(call flag,targets,TARGETS) $(call flag,episodes,EPISODES)
+STUDY_FLAGS = $(ROBOT_FLAGS) $(call flag,base,BASE) $(TARGET_FLAGS) $(call flag,budget,PRESET) \
+	$(call flag,iterations,ITERATIONS)
+STUDIES = validity comparison penalty heat_map motion_types physical_behaviour training_dynamics relearning membership
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help unlearn pretrain evaluate export video motions bench tables test lint format clean
+.PHONY: help unlearn sweep experiments pretrain evaluate export video motions bench tables test lint format clean
 
 help: ## this list
 	@echo 'make TARGET [VARIABLE=value ...]'
@@ -43,6 +47,14 @@ help: ## this list
 
 unlearn: .venv/.installed ## forget TARGETS, then evaluate base and unlearned policy side by side
 	$(MODULE).unlearn $(strip $(TRAIN_FLAGS) $(TARGET_FLAGS) $(call flag,penalty,LAMBDA) $(call flag,method,METHOD) $(ARGS))
+
+sweep: .venv/.installed ## several unlearning runs that differ in one thing, with table and figure
+	$(MODULE).sweep $(or $(SWEEP),lambda) $(strip $(STUDY_FLAGS) $(call flag,output,OUTPUT) $(ARGS))
+
+experiments: .venv/.installed ## run what is missing of the paper's studies (hours), then write their pages
+	@status=0; for study in $(STUDIES); do \
+		.venv/bin/python -m experiments.$$study $(strip $(STUDY_FLAGS) $(ARGS)) || status=$$?; \
+	done; exit $$status
 
 pretrain: .venv/.installed ## train a base policy on every clip
 	$(MODULE).train $(strip $(TRAIN_FLAGS) $(ARGS))
@@ -65,8 +77,11 @@ motions: .venv/.installed ## make a library from your own clips (ARGS=--help say
 bench: .venv/.installed ## steps per second of training on this machine
 	$(MODULE).bench $(strip $(ROBOT_FLAGS) $(call flag,preset,PRESET) $(ARGS))
 
-tables: .venv/.installed ## rewrite the README's tables from the evaluation files they name
+tables: .venv/.installed ## rewrite the README's tables and the studies' pages from the stored numbers alone
 	$(MODULE).evaluation.tables README.md
+	@for study in $(STUDIES); do \
+		test ! -f experiments/results/$$study.json || .venv/bin/python -m experiments.$$study --draw || exit; \
+	done
 
 test: .venv/.installed ## run the tests
 	.venv/bin/python -m pytest $(ARGS)
@@ -74,7 +89,7 @@ test: .venv/.installed ## run the tests
 lint: .venv/.installed ## check style, formatting and types
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
-	.venv/bin/mypy forgetmimic_jax
+	.venv/bin/mypy forgetmimic_jax experiments
 
 format: .venv/.installed ## put the code in its format
 	.venv/bin/ruff check --fix .

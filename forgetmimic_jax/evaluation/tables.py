@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -125,14 +125,14 @@ def _clip_rows(document: Mapping[str, Any], *, digits: int = 3, interval: bool =
     for clip in clip_order(document):
         role = "target" if clips[clip]["target"] else "kept"
         of = {policy: policies[policy]["clips"][clip] for policy in policies}
-        success = [_percent(of[policy]["success_rate"], interval=interval) for policy in shown]
-        tracking = [_number(of[policy]["survival_weighted_tracking"], digits, interval) for policy in shown]
+        success = [percent(of[policy]["success_rate"], interval=interval) for policy in shown]
+        tracking = [number(of[policy]["survival_weighted_tracking"], digits, interval) for policy in shown]
         row = [clip, role, " → ".join(success), " → ".join(tracking)]
         if ZERO_ACTION in policies:
-            row.append(_number(of[ZERO_ACTION]["survival_weighted_tracking"], digits, interval))
+            row.append(number(of[ZERO_ACTION]["survival_weighted_tracking"], digits, interval))
         if len(shown) == 2:
             left = of[shown[1]].get("skill" if ZERO_ACTION in policies else "retention")
-            row += [_percent(left, interval=interval), _verdict(left, role)]
+            row += [percent(left, interval=interval), _verdict(left, role)]
         rows.append(row)
     return _Rows("Clip by clip", header, rows)
 
@@ -153,11 +153,11 @@ def _group_rows(document: Mapping[str, Any], *, digits: int = 3) -> _Rows:
         if not any(group in policies[policy] for policy in order):
             continue
         for label, metric, show in (
-            ("success", "success_rate", _percent),
-            ("tracking", "survival_weighted_tracking", _number),
-            ("while alive", "tracking_reward", _number),
-            ("skill left", "skill", _percent),
-            ("retention", "retention", _percent),
+            ("success", "success_rate", percent),
+            ("tracking", "survival_weighted_tracking", number),
+            ("while alive", "tracking_reward", number),
+            ("skill left", "skill", percent),
+            ("retention", "retention", percent),
         ):
             cells = [show(policies[policy].get(group, {}).get(metric), digits) for policy in order]
             if any(cells):
@@ -166,7 +166,7 @@ def _group_rows(document: Mapping[str, Any], *, digits: int = 3) -> _Rows:
         ("degradation ratio", "degradation_ratio"),
         ("ratio of tracking", "survival_weighted_degradation_ratio"),
     ):
-        cells = [_number(policies[policy].get(metric), digits) for policy in order]
+        cells = [number(policies[policy].get(metric), digits) for policy in order]
         if any(cells):
             rows.append([label, *cells])
     return _Rows("Targets and kept clips", ["", *(_words(policy) for policy in order)], rows)
@@ -181,7 +181,7 @@ def _error_rows(document: Mapping[str, Any]) -> _Rows:
         for metric in sorted(metrics.keys() - REWARDS):
             name, common = metric.removesuffix("_common"), metric.endswith("_common")
             label = f"{_words(name)}, {UNITS.get(name, 'm')}{', common steps' if common else ''}"
-            rows.append([f"{group}: {label}", *(_number(policies[policy][group].get(metric)) for policy in order)])
+            rows.append([f"{group}: {label}", *(number(policies[policy][group].get(metric)) for policy in order)])
     return _Rows("Errors", ["", *(_words(policy) for policy in order)], rows)
 
 
@@ -236,11 +236,13 @@ def _words(name: str) -> str:
     return name.replace("_", " ")
 
 
-def _number(value: Estimate | None, digits: int = 3, interval: bool = True) -> str:
+def number(value: Estimate | None, digits: int = 3, interval: bool = True) -> str:
+    """An estimate as "mean [low, high]"; empty where there is none."""
     return _cell(value, interval, digits, scale=1.0, unit="")
 
 
-def _percent(value: Estimate | None, digits: int = 0, interval: bool = True) -> str:
+def percent(value: Estimate | None, digits: int = 0, interval: bool = True) -> str:
+    """The same in whole per cent."""
     return _cell(value, interval, 0, scale=100.0, unit=" %")
 
 
@@ -254,11 +256,15 @@ def _cell(value: Estimate | None, interval: bool, digits: int, *, scale: float, 
 
 
 def _markdown(table: _Rows) -> str:
-    lines = [f"**{table.title}**", "", _line(table.header), _line(["---"] * len(table.header))]
-    return "\n".join([*lines, *map(_line, table.rows), ""])
+    return f"**{table.title}**\n\n{markdown_table(table.header, table.rows)}"
 
 
-def _line(cells: list[str]) -> str:
+def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table in Markdown, with the line end after its last row."""
+    return "\n".join([*map(_line, [header, ["---"] * len(header), *rows]), ""])
+
+
+def _line(cells: Sequence[str]) -> str:
     return f"| {' | '.join(cell.replace('|', '&#124;') for cell in cells)} |"
 
 

@@ -17,7 +17,7 @@ from forgetmimic_jax.state import Policy
 
 FILE = "evaluations.jsonl"
 EPISODES = 6  # a clip: enough to see a trend, not to report
-SHOWN = ("success_rate", "survival_weighted_tracking")
+SHOWN = ("success_rate", "survival_weighted_tracking", "tracking_reward")
 
 
 class Watch:

@@ -171,7 +171,7 @@ def test_figures_are_written(tmp_path, document):
 
 def test_a_runs_clips_are_drawn_over_its_environment_steps(tmp_path, monkeypatch):
     drawn = []
-    monkeypatch.setattr(plots, "_save", lambda figure, path: drawn.append(figure))
+    monkeypatch.setattr(plots, "save", lambda figure, path: drawn.append(figure))
     rows = [
         {
             "environment_steps": 1_000_000 * (i + 1),

@@ -1,0 +1,71 @@
+"""Every method at the same budget, and arft with every sampler, with and without the wrench (paper, table 1)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from forgetmimic_jax.evaluation import paper, statistics
+from forgetmimic_jax.evaluation.tables import markdown_table, number
+from forgetmimic_jax.evaluation.variants import variant_bars, variant_table
+from forgetmimic_jax.study import Lab, Study, main
+from forgetmimic_jax.sweep import ablation
+
+CONTROL = "fine-tuned, all clips"
+METHODS: dict[str, dict[str, Any]] = {
+    "fine-tuned, kept clips": {"method": "finetune"},
+    CONTROL: {"method": "finetune", "clips": "all"},
+    **{
+        name.replace("_", " "): {"method": name}
+        for name in (
+            *("random_reward", "decremental", "poisoning", "trajdeleter"),
+            *("negated_reward", "gradient_ascent", "policy_edit"),
+        )
+    },
+    "arft, λ = 8": {"penalty": 8.0},
+}
+
+
+def measure(lab: Lab) -> dict[str, Any]:
+    """Every method and the ablation; a retrained policy as often as the budget allows."""
+    retrain = {"retrained": {"method": "retrain", "iterations": lab.control_iterations}}
+    arft = {f"arft, {label}": variant for label, variant in ablation().items()}
+    return lab.over_seeds({**retrain, **METHODS, **arft}, "comparison", seeds={"retrained": lab.control_seeds})
+
+
+def tell(document: Mapping[str, Any]) -> str:
+    """The table, and the differences from base and fine-tuned control, seed by seed."""
+    variants = document["results"]["variants"]
+    parts = [variant_table(variants, paper.COMPARISON)]
+    if CONTROL in variants:
+        header = ["", "kept success - base's, points", "- the control's", "kept tracking - base's", "- the control's"]
+        rows = [[label, *differences(variants, label)] for label in variants]
+        parts.append(f"**Kept clips against the base and against the control ({CONTROL})**\n")
+        parts.append(markdown_table(header, rows))
+    return "\n".join(parts)
+
+
+def differences(variants: Mapping[str, Any], label: str) -> list[str]:
+    """What a variant's kept clips gained on the base's and on the control's of the same seed, over the seeds."""
+    control = variants[CONTROL]["seeds"]
+    runs = {seed: run for seed, run in variants[label]["seeds"].items() if seed in control}
+    cells = []
+    for metric, scale, digits in (("success_rate", 100.0, 1), ("survival_weighted_tracking", 1.0, 3)):
+        for other in ({seed: runs[seed]["base"] for seed in runs}, {seed: control[seed]["policy"] for seed in runs}):
+            pairs = [(run["policy"]["kept"][metric], other[seed]["kept"][metric]) for seed, run in runs.items()]
+            cells.append(number(statistics.over_seeds([scale * (a - b) for a, b in pairs]), digits) if pairs else "")
+    return cells
+
+
+STUDY = Study(
+    name="comparison",
+    title="Every method at the same budget",
+    iterations={"cpu": 400, "paper": 1000},
+    asks=(),
+    measure=measure,
+    tell=tell,
+    draw=lambda document: variant_bars(document["results"]["variants"]),
+)
+
+if __name__ == "__main__":
+    main(STUDY)

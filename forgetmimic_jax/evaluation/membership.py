@@ -1,0 +1,68 @@
+"""Membership inference: can one tell from what a policy does that it was trained on a clip?
+
+Tier 1: a clip against its mirror image, which is as hard and was never trained on. The attacker knows which clips were
+kept, learns from them and from their images what having been trained on looks like, and is asked about the targets.
+The features are the paper's: tracking reward, success and episode length. It is a probe: what it finds is evidence,
+what it does not find may still be there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from forgetmimic_jax.evaluation.metrics import Rollout, episode_metrics
+
+FALSE_POSITIVES = 0.05
+
+
+@dataclass(frozen=True)
+class Attack:
+    """How well members are told from their never-trained twins; 0.5, 0.5 and 0.05 is guessing."""
+
+    accuracy: float
+    auc: float
+    tpr_at_5_percent_fpr: float
+
+
+def features(member: Rollout, twin: Rollout) -> tuple[np.ndarray, np.ndarray]:
+    """Features f[E, 3] of both, z-scored clip by clip over a clip's and its twin's episodes together.
+
+    Args:
+        member: of the clips.
+        twin: of their mirror images, in the same order, with as many episodes each.
+    """
+    both = []
+    for rollout in (member, twin):
+        metrics = episode_metrics(rollout)
+        share = metrics["episode_length"] / rollout.horizon
+        both.append(np.stack([metrics["tracking_reward"], metrics["success_rate"], share], axis=-1))
+    for clip in np.unique(member.clip):
+        pair = np.concatenate([values[member.clip == clip] for values in both])
+        mean, std = pair.mean(0), pair.std(0)
+        for values in both:
+            values[member.clip == clip] = (values[member.clip == clip] - mean) / np.where(std > 0, std, 1.0)
+    return both[0], both[1]
+
+
+def discriminant(members: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, float]:
+    """Fisher's linear discriminant: direction f[feature] and the score half-way between the two means."""
+    within = np.cov(members, rowvar=False) + np.cov(others, rowvar=False)
+    direction = np.linalg.solve(within + 1e-3 * np.eye(len(within)), members.mean(0) - others.mean(0))
+    return direction, float(direction @ (members.mean(0) + others.mean(0)) / 2.0)
+
+
+def attack(known: tuple[np.ndarray, np.ndarray], asked: tuple[np.ndarray, np.ndarray]) -> Attack:
+    """Learn from `known` (members, others), each f[E, feature], and tell the `asked` apart."""
+    direction, threshold = discriminant(*known)
+    members, others = (values @ direction for values in asked)
+    accuracy = 0.5 * ((members > threshold).mean() + (others <= threshold).mean())
+    strict = np.quantile(others, 1.0 - FALSE_POSITIVES, method="higher")
+    return Attack(float(accuracy), auc(members, others), float((members > strict).mean()))
+
+
+def auc(members: np.ndarray, others: np.ndarray) -> float:
+    """Chance that a member scores above another, a tie counting half (Mann-Whitney U over its largest value)."""
+    return float(stats.mannwhitneyu(members, others).statistic / (len(members) * len(others)))

@@ -1,0 +1,126 @@
+"""Variants of an unlearning run over seeds: from their evaluation.json to one table and one figure.
+
+`results["variants"]` of a study: {label: {"options", "seeds": {seed: summary}, "over_seeds": summary of estimates}}.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from forgetmimic_jax.evaluation import statistics
+from forgetmimic_jax.evaluation.metrics import BASE, ZERO_ACTION
+from forgetmimic_jax.evaluation.plots import bars, new_figure
+from forgetmimic_jax.evaluation.tables import markdown_table, number, percent
+from forgetmimic_jax.rows import read_rows
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+METRICS = ("success_rate", "survival_weighted_tracking", "tracking_reward", "episode_length", "skill", "retention")
+RATIOS = ("degradation_ratio", "survival_weighted_degradation_ratio")
+
+
+HEADER = ("seeds", "success", "tracking", "while alive", "steps", "skill left")
+NOTES = (
+    "tracking: mean tracking reward over the horizon, 0 after a fall (survival-weighted); while alive: the paper's, "
+    "over the steps before it.",
+    "skill left: share of the base's skill above the zero action; ratio: target over kept, of tracking while alive "
+    "(the paper's) and of tracking.",
+    "Rows of the paper: another library of clips, another base and another budget.",
+)
+
+
+def summary(folder: Path) -> dict[str, Any]:
+    """The means of a finished trial's evaluation: {"base", "policy", "zero_action": {"target", "kept", "clips", ...}}.
+
+    With `lambda_crit`: the threshold on target steps in the first logged iterations, when the policy still is the base.
+    """
+    document = json.loads((folder / "evaluation.json").read_text())
+    result: dict[str, Any] = {}
+    for name, policy in document["policies"].items():
+        groups = {group: _means(policy[group]) for group in ("target", "kept") if group in policy}
+        clips = {clip: _means(metrics) for clip, metrics in policy["clips"].items()}
+        ratios = {ratio: policy[ratio]["mean"] for ratio in RATIOS if "mean" in policy.get(ratio, {})}
+        result[name if name in (BASE, ZERO_ACTION) else "policy"] = {**groups, "clips": clips, **ratios}
+    rows = read_rows(folder / "metrics.jsonl")
+    if rows and "target/lambda_crit" in rows[0]:
+        result["lambda_crit"] = rows[0]["target/lambda_crit"]
+    return result
+
+
+def _means(metrics: Mapping[str, Any]) -> dict[str, float]:
+    return {name: metrics[name]["mean"] for name in METRICS if "mean" in metrics.get(name, {})}
+
+
+def over_seeds(runs: Sequence[Any]) -> Any:
+    """Nested numbers, one tree a seed, as one tree of estimates; a number that only some seeds have is over those."""
+    if not isinstance(runs[0], Mapping):
+        return statistics.over_seeds(runs)
+    names = dict.fromkeys(name for run in runs for name in run)
+    return {name: over_seeds([run[name] for run in runs if name in run]) for name in names}
+
+
+def variant_table(variants: Mapping[str, Any], theirs: Mapping[str, Any]) -> str:
+    """Targets, then kept clips: base, zero action and every variant over seeds, and the paper's own numbers.
+
+    Where variants have targets of their own, each has its own base beside it.
+    """
+    targets = {variant["options"].get("targets") for variant in variants.values()}
+    policies: dict[str, Any] = {}
+    for place, (label, variant) in enumerate(variants.items()):
+        of = variant["over_seeds"]
+        if len(targets) > 1 or place == 0:
+            whose = f" ({label})" if len(targets) > 1 else ""
+            policies |= {f"{name.replace('_', ' ')}{whose}": of[name] for name in (BASE, ZERO_ACTION)}
+        policies[label] = of["policy"]
+    policies |= {f"*paper: {label}*": _exact(numbers) for label, numbers in theirs.items()}
+    target = [[label, *_cells(policy.get("target", {}))] for label, policy in policies.items()]
+    kept = [
+        [label, *_cells(policy.get("kept", {})), *(number(policy.get(ratio), 2) for ratio in RATIOS)]
+        for label, policy in policies.items()
+    ]
+    tables = [
+        f"**Targets**\n\n{markdown_table(['', *HEADER], target)}",
+        f"**Kept clips**\n\n{markdown_table(['', *HEADER, 'ratio while alive', 'ratio of tracking'], kept)}",
+    ]
+    return "\n".join([*tables, *(f"- {note}" for note in NOTES), ""])
+
+
+def _cells(group: Mapping[str, Any]) -> list[str]:
+    success, tracking, alive = (_within(group.get(metric), 0.0, 1.0) for metric in METRICS[:3])
+    n = next((estimate["n"] for estimate in group.values() if estimate["n"]), "")
+    steps = number(group.get("episode_length"), 0)
+    return [str(n), percent(success), number(tracking, 2), number(alive, 2), steps, percent(group.get("skill"))]
+
+
+def _within(estimate: Mapping[str, Any] | None, low: float, high: float) -> Any:
+    """An estimate whose interval does not leave what the number can be."""
+    if estimate is None or "low" not in estimate:
+        return estimate
+    return {**estimate, "low": max(low, estimate["low"]), "high": min(high, estimate["high"])}
+
+
+def _exact(numbers: Any) -> Any:
+    """Numbers of the paper, which has no interval for them, as estimates."""
+    if isinstance(numbers, Mapping):
+        return {name: _exact(value) for name, value in numbers.items()}
+    return {"mean": numbers, "n": 0}
+
+
+def variant_bars(variants: Mapping[str, Any]) -> Figure:
+    """Success, tracking, tracking while alive and steps of targets and kept clips, base and variants."""
+    first = next(iter(variants.values()))["over_seeds"]
+    policies = {"base": first[BASE]} | {label: variant["over_seeds"]["policy"] for label, variant in variants.items()}
+    figure = new_figure(width=2.0 + 0.8 * len(policies), height=9.0)
+    for place, metric in enumerate(METRICS[:4]):
+        axes = figure.add_subplot(4, 1, place + 1)
+        of = {group: [policy.get(group, {}) for policy in policies.values()] for group in ("target", "kept")}
+        series = {group: [metrics.get(metric, {}) for metrics in of[group]] for group in of}
+        bars(axes, list(policies), series)
+        axes.set_ylim(0.0, None if metric == "episode_length" else 1.02)
+        axes.set_ylabel(metric.replace("_", " "))
+    figure.axes[0].legend(ncols=2, loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
+    return figure

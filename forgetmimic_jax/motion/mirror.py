@@ -1,0 +1,44 @@
+"""The other-handed twin of a clip: as hard to track as the clip itself, and never trained on."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.motion.clip import Clip
+from forgetmimic_jax.robot import Robot
+
+PSEUDOVECTOR = np.array([-1.0, 1.0, -1.0])  # what a reflection of y does to an axis of rotation
+
+
+def mirrored(robot: Robot, clip: Clip) -> Clip:
+    """The clip reflected in the robot's xz-plane: left and right trade places. Its name ends with `_mirrored`.
+
+    Raises:
+        InputError: a joint without a counterpart on the other side, or one that turns about no mirrored axis.
+    """
+    axes = {name: robot.model.joint(name).axis for name in clip.joint_names}
+    joint_pos = np.empty_like(clip.joint_pos)
+    for place, name in enumerate(clip.joint_names):
+        other = _other_side(name)
+        if other not in axes:
+            raise InputError(f"robot {robot.name}: joint '{name}' has no counterpart '{other}'; it has no mirror image")
+        sign = float(np.dot(PSEUDOVECTOR * axes[other], axes[name]))
+        if abs(abs(sign) - 1.0) > 1e-3:
+            raise InputError(f"robot {robot.name}: the axes of '{name}' and '{other}' are no mirror images")
+        joint_pos[:, place] = np.sign(sign) * clip.joint_pos[:, clip.joint_names.index(other)]
+    return dataclasses.replace(
+        clip,
+        name=f"{clip.name}_mirrored",
+        root_pos=clip.root_pos * [1.0, -1.0, 1.0],
+        root_quat=clip.root_quat * [1.0, -1.0, 1.0, -1.0],
+        joint_pos=joint_pos,
+    )
+
+
+def _other_side(name: str) -> str:
+    if name.startswith("left_"):
+        return "right_" + name.removeprefix("left_")
+    return "left_" + name.removeprefix("right_") if name.startswith("right_") else name

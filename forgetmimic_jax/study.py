@@ -1,0 +1,342 @@
+"""A study: trials, what is measured of them, and how it is told: one JSON, one page with its table, one figure.
+
+The JSON is the only source of the page and the figure. Every study takes the same options and finds the finished trials
+of the others (`trials`); one whose JSON already answers what is asked runs nothing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import sys
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
+
+import tyro
+from rich.console import Console
+from rich.markdown import Markdown
+
+from forgetmimic_jax.config import Config, preset
+from forgetmimic_jax.console import closing, progress
+from forgetmimic_jax.errors import InputError, run_command
+from forgetmimic_jax.evaluation.plots import save
+from forgetmimic_jax.evaluation.variants import over_seeds, summary, variant_bars, variant_table
+from forgetmimic_jax.motion.clip import write_atomically
+from forgetmimic_jax.options import Settings, at_least, comma_separated, replace_given
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from forgetmimic_jax.evaluation.metrics import Rollout
+    from forgetmimic_jax.motion.clip import Clip
+
+RESULTS = Path(__file__).resolve().parents[1] / "experiments" / "results"
+K = TypeVar("K", bound=Hashable)
+
+
+@dataclass(kw_only=True)
+class Options:
+    """Run what is missing of a study, then write its JSON, its page and its figure."""
+
+    robot: str = "g1"
+    """Robot under robots/."""
+    base: Path | None = None
+    """Checkpoint that every trial starts from; the shipped data/ROBOT/base by default."""
+    targets: str | None = None
+    """Clips to forget, comma-separated; the library's default targets (g1: punch,kick) by default."""
+    budget: Literal["cpu", "paper"] = "cpu"
+    """cpu finishes on a laptop; paper takes the paper's settings and iterations, for a GPU."""
+    iterations: int | None = None
+    """PPO iterations of each trial; the budget's by default."""
+    control_iterations: int | None = None
+    """Iterations of the retrained and fresh controls; as many steps as the base was trained for by default."""
+    seeds: int = 3
+    """Runs of each kind, with the seeds 0, 1, ...: what intervals are over."""
+    episodes: int = 20
+    """Evaluation episodes a clip."""
+    jobs: int = 1
+    """Trials at a time; each of them uses all cores of a CPU."""
+    trials: Path = Path("runs/trials")
+    """Folder of the trials, in which every study finds the finished ones again."""
+    physics: Literal["auto", "native", "mjx", "mjx-warp"] | None = None
+    """Physics engine; auto is native on a CPU and mjx on a GPU or TPU."""
+    library: Path | None = None
+    """Folder of clips; the base's by default."""
+    output: Path | None = None
+    """Folder for NAME.json, NAME.md, NAME.png and NAME.svg; experiments/results by default."""
+    draw: bool = False
+    """Only write page and figure again, from the JSON."""
+    set: Settings = field(default_factory=list)
+    """Any other settings of every trial, such as ppo.learning_rate=1e-4."""
+
+
+@dataclass(frozen=True)
+class Study:
+    """What makes a study.
+
+    Args:
+        name: of its files.
+        title: what is asked, in a few words.
+        iterations: of each trial, by budget.
+        asks: what beside the options the answer depends on, such as the values of a sweep.
+        measure: runs the trials; the JSON's `results`.
+        tell: (document) → the page's body in Markdown: tables, and what has to be said of them.
+        draw: (document) → its figure.
+    """
+
+    name: str
+    title: str
+    iterations: Mapping[str, int]
+    asks: Sequence[str]
+    measure: Callable[[Lab], dict[str, Any]]
+    tell: Callable[[Mapping[str, Any]], str]
+    draw: Callable[[Mapping[str, Any]], Figure]
+
+
+class Lab:
+    """Where a study's trials are run: the options, resolved."""
+
+    def __init__(self, options: Options, iterations: int):
+        from forgetmimic_jax import checkpoint, runner
+
+        for flag in ("seeds", "episodes", "jobs"):
+            at_least(1, f"--{flag}", getattr(options, flag))
+        at_least(1, "--iterations", iterations)
+        self.options, self.iterations = options, iterations
+        self.base = options.base or runner.base_folder(options.robot)
+        self.info = checkpoint.read_info(self.base)
+        self.config: Config = replace_given(self.info.config, library=options.library)
+        self.targets = (
+            runner.default_targets(self.config) if options.targets is None else comma_separated(options.targets)
+        )
+        if not self.targets:
+            raise InputError("--targets: no clip named; name at least one to forget, such as --targets punch,kick")
+        runner.check_targets(self.targets, self.info.clips)
+        self.seeds = tuple(range(options.seeds))
+        self.failed: dict[str, str] = {}
+
+    @property
+    def control_iterations(self) -> int:
+        """Of a policy that is trained from scratch: as many environment steps as the base's unless told otherwise."""
+        ppo = preset("paper").ppo if self.options.budget == "paper" else self.config.ppo
+        steps = ppo.num_envs * ppo.num_steps
+        return self.options.control_iterations or max(1, round(self.info.environment_steps / steps))
+
+    @property
+    def control_seeds(self) -> tuple[int, ...]:
+        """Of a policy that is trained from scratch, which a laptop can afford once."""
+        return self.seeds[:1] if self.options.budget == "cpu" else self.seeds
+
+    def asked(self) -> dict[str, Any]:
+        """What a result is the answer to."""
+        from forgetmimic_jax.checkpoint import META
+
+        return {
+            "robot": self.options.robot,
+            "base": hashlib.sha256((self.base / META).read_bytes()).hexdigest()[:16],
+            "base_environment_steps": self.info.environment_steps,
+            "library": self.info.library_hash,
+            "targets": list(self.targets),
+            "budget": self.options.budget,
+            "iterations": self.iterations,
+            "control_iterations": self.control_iterations,
+            "seeds": len(self.seeds),
+            "episodes": self.options.episodes,
+            "set": list(itertools.chain(*self.options.set)),
+        }
+
+    def run(self, variants: Mapping[K, Mapping[str, Any]], what: str) -> dict[K, Path]:
+        """Train and evaluate what differs from the default unlearning run as told; the folders of those that finished.
+
+        Args:
+            variants: by any key, options of `forgetmimic_jax.unlearn`; `set` adds to the study's own.
+            what: is being done, for the progress line.
+        """
+        from forgetmimic_jax.trials import make_trial, run_trials
+
+        options = self.options
+        common: dict[str, Any] = {"robot": options.robot, "base": self.base, "targets": ",".join(self.targets)}
+        common |= {"iterations": self.iterations, "episodes": options.episodes, "physics": options.physics}
+        common |= {"library": options.library, "preset": "paper" if options.budget == "paper" else None}
+        settings = list(itertools.chain(*options.set))
+        trials = {}
+        for key, variant in variants.items():
+            asked = {**common, **variant}
+            together = [*settings, *variant.get("set", [])]
+            asked.pop("set", None)
+            trials[key] = make_trial(options.trials, asked | ({"set": together} if together else {}))
+        failed = run_trials(list(trials.values()), jobs=options.jobs, description=what)
+        self.failed |= {trial.folder.name: reason for trial, reason in failed.items()}
+        finished = {key: trial.folder for key, trial in trials.items() if trial not in failed}
+        if not finished:
+            raise InputError(f"{what}: every trial failed; the first: {next(iter(failed.values()))}")
+        return finished
+
+    def over_seeds(
+        self, variants: Mapping[str, Mapping[str, Any]], what: str, *, seeds: Mapping[str, Sequence[int]] | None = None
+    ) -> dict[str, Any]:
+        """Every variant with every seed, and what they have in common over the seeds.
+
+        Args:
+            variants: by label, options of `forgetmimic_jax.unlearn`.
+            what: is being done.
+            seeds: by label, other seeds than the study's.
+        """
+        every = {label: (seeds or {}).get(label, self.seeds) for label in variants}
+        folders = self.run(
+            {(label, seed): {**variants[label], "seed": seed} for label in variants for seed in every[label]}, what
+        )
+        result = {}
+        for label, variant in variants.items():
+            runs = {seed: summary(folders[label, seed]) for seed in every[label] if (label, seed) in folders}
+            if runs:
+                result[label] = {
+                    "options": {name: str(value) for name, value in variant.items()},
+                    "seeds": {str(seed): run for seed, run in runs.items()},
+                    "over_seeds": over_seeds(list(runs.values())),
+                }
+        return {"variants": result}
+
+    def rollouts(
+        self, policies: Mapping[K, Path], clips: Sequence[Clip] | None = None
+    ) -> tuple[dict[K, Rollout], tuple[str, ...]]:
+        """Every policy on the same episodes, and the clips' names.
+
+        Args:
+            policies: checkpoints by any key.
+            clips: other clips than the library's.
+        """
+        from forgetmimic_jax import checkpoint, runner
+        from forgetmimic_jax.evaluation.rollout import Evaluator
+        from forgetmimic_jax.motion.library import build_library
+        from forgetmimic_jax.options import on_engine
+
+        setup = runner.make_setup(on_engine(self.config, self.options.physics))
+        library = setup.library if clips is None else build_library(setup.robot, clips)
+        evaluator = Evaluator(setup.config, setup.robot, library, episodes=self.options.episodes, seed=0)
+        shapes = runner.template(setup)
+        rolled = {}
+        with progress("roll out", len(policies)) as report:
+            for done, (key, path) in enumerate(policies.items(), start=1):
+                rolled[key] = evaluator.rollout(checkpoint.load_policy(path, shapes))
+                report(done, 0, {})
+        return rolled, library.names
+
+
+def newest_policy(folder: Path) -> Path:
+    """The checkpoint that a finished trial ended with."""
+    from forgetmimic_jax import checkpoint
+
+    newest = checkpoint.newest_checkpoint(folder)
+    assert newest is not None
+    return newest
+
+
+def conduct(study: Study, options: Options, next_command: str) -> None:
+    """Measure what the JSON does not hold already, and tell it; exit code 1 where a trial failed."""
+    from forgetmimic_jax import runner
+
+    folder = options.output or RESULTS
+    runner.check_writable(folder)
+    path = folder / f"{study.name}.json"
+    document = _read(path)
+    if options.draw:
+        if document is None:
+            raise InputError(f"{path}: not measured yet; leave --draw out")
+    else:
+        iterations = study.iterations[options.budget] if options.iterations is None else options.iterations
+        lab = Lab(options, iterations)
+        asked = lab.asked() | {"asks": list(study.asks)}
+        if document is None or document["asked"] != asked or document["failed"]:
+            results = study.measure(lab)
+            document = {"schema": 1, "study": study.name, "asked": asked, "failed": lab.failed, "results": results}
+            folder.mkdir(parents=True, exist_ok=True)
+            write_atomically(path, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
+    files = {"numbers": path, "page": path.with_suffix(".md")}
+    write_atomically(files["page"], page(study, document).encode())
+    files |= {f"figure ({kind})": path.with_suffix(f".{kind}") for kind in ("png", "svg")}
+    for kind in ("png", "svg"):
+        save(study.draw(document), path.with_suffix(f".{kind}"))
+    console = Console()
+    console.print(Markdown(study.tell(document)))
+    closing(files, next_command, console=console)
+    if document["failed"]:
+        print(f"{len(document['failed'])} trials failed; the same command tries them again", file=sys.stderr)
+        sys.exit(1)
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    try:
+        return json.loads(path.read_text()) if path.is_file() else None
+    except ValueError as error:
+        raise InputError(f"{path}: damaged: {error}; remove it to measure again") from None
+
+
+def page(study: Study, document: Mapping[str, Any]) -> str:
+    """The whole page in Markdown."""
+    asked = document["asked"]
+    lines = [
+        f"# {study.title}",
+        "",
+        f"- Robot {asked['robot']}; base trained for {asked['base_environment_steps']:,} environment steps; targets "
+        f"{', '.join(asked['targets'])}.",
+        f"- {asked['iterations']:,} iterations a trial with the {asked['budget']} budget, {asked['seeds']} seed(s), "
+        f"{asked['episodes']} episodes a clip.",
+        "- In square brackets: the 95 % interval over seeds (Student's t); the seed is the unit. One seed has none.",
+        *(f"- Failed: `{name}`: {reason}" for name, reason in document["failed"].items()),
+        "",
+        study.tell(document),
+        f"![{study.title}]({study.name}.png)",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def variants_study(
+    name: str,
+    title: str,
+    iterations: Mapping[str, int],
+    variants: Callable[[Lab], Mapping[str, Mapping[str, Any]]],
+    theirs: Mapping[str, Any],
+    *,
+    asks: Sequence[str] = (),
+    tell: Callable[[Mapping[str, Any]], str] | None = None,
+    draw: Callable[[Mapping[str, Any]], Figure] | None = None,
+) -> Study:
+    """A study of the usual kind: variants over seeds, a row of the table and a pair of bars each.
+
+    Args:
+        name: of its files.
+        title: what is asked.
+        iterations: of each trial, by budget.
+        variants: by label, the options of `forgetmimic_jax.unlearn` that a lab is to try.
+        theirs: the paper's numbers.
+        asks: see `Study`.
+        tell: another page than the table, from the document.
+        draw: another figure than the bars.
+    """
+    return Study(
+        name=name,
+        title=title,
+        iterations=iterations,
+        asks=asks,
+        measure=lambda lab: lab.over_seeds(variants(lab), name),
+        tell=tell or (lambda document: variant_table(document["results"]["variants"], theirs)),
+        draw=draw or (lambda document: variant_bars(document["results"]["variants"])),
+    )
+
+
+def main(study: Study, options: type[Options] = Options, arguments: Iterable[str] | None = None) -> None:
+    """The command of a study's file."""
+    program = f"python -m experiments.{study.name}"
+    given = tyro.cli(
+        options,
+        prog=program,
+        description=f"{study.title}. {Options.__doc__}",
+        args=None if arguments is None else list(arguments),
+        config=(tyro.conf.FlagCreatePairsOff,),
+    )
+    run_command(lambda: conduct(study, given, "make experiments"))

@@ -1,0 +1,255 @@
+"""Sweeps and studies in miniature. Trials run in this process, where the miniature's iteration is compiled already."""
+
+import importlib
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from miniature import Run, finished
+from scipy import stats
+
+from forgetmimic_jax import study, sweep, trials, unlearn
+from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.options import parse
+
+STUDIES = (
+    *("validity", "comparison", "penalty", "heat_map", "motion_types", "physical_behaviour", "training_dynamics"),
+    *("relearning", "membership"),
+)
+
+
+class InProcess:
+    """A trial's process that has ended already."""
+
+    def __init__(self, trial: trials.Trial):
+        arguments = [*trial.flags, "--output", str(trial.folder)]
+        self.returncode = 0
+        try:
+            unlearn.main(parse(unlearn.Options, "unlearn", arguments))
+        except InputError as error:
+            trial.log.write_text(f"error: {error}\n")
+            self.returncode = 2
+
+    def poll(self) -> int:
+        return self.returncode
+
+
+def start(trial: trials.Trial) -> subprocess.Popen:
+    trial.log.parent.mkdir(parents=True, exist_ok=True)
+    return InProcess(trial)  # type: ignore[return-value]
+
+
+def options(of: type, base_run: Run, folder: Path, **given):
+    return of(**{
+        **{"base": base_run.checkpoint(4), "targets": "turn", "iterations": 2, "episodes": 2, "seeds": 2},
+        **{"trials": folder / "trials", "output": folder / "out", **given},
+    })  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def swept(base_run, tmp_path_factory) -> tuple[Path, str]:
+    """A sweep over two seeds, from its trials to its files; its folder, and what it printed."""
+    folder = tmp_path_factory.mktemp("sweep")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trials, "POLL", 0.0)
+        patch.setattr(trials, "_start", start)
+        asked = options(sweep.Options, base_run, folder, kind="seeds")
+        run = finished(sweep.main, asked)
+    return folder, run.printed
+
+
+def test_a_sweep_writes_numbers_page_and_figure(swept):
+    folder, printed = swept
+    assert sorted(path.name for path in (folder / "out").iterdir()) == [
+        *("seeds.json", "seeds.md", "seeds.png", "seeds.svg"),
+    ]
+    assert (folder / "out" / "seeds.png").read_bytes().startswith(b"\x89PNG")
+    assert "<svg" in (folder / "out" / "seeds.svg").read_text()
+    page = (folder / "out" / "seeds.md").read_text()
+    assert page.startswith("# The default run\n")
+    assert "base trained for 128 environment steps; targets turn." in page
+    assert "2 iterations a trial with the cpu budget, 2 seed(s), 2 episodes a clip." in page
+    assert "*paper: λ = 16*" in page
+    assert "Next: make experiments" in printed
+
+
+def test_its_numbers_are_those_of_the_trials_over_the_seeds(swept):
+    folder, _ = swept
+    document = json.loads((folder / "out" / "seeds.json").read_text())
+    variant = document["results"]["variants"]["λ = 16"]
+    runs = sorted((folder / "trials").glob("*/evaluation.json"))
+    assert len(runs) == 2
+    for group in ("target", "kept"):
+        for metric in ("survival_weighted_tracking", "episode_length"):
+            values = [json.loads(run.read_text())["policies"]["unlearned"][group][metric]["mean"] for run in runs]
+            found = variant["over_seeds"]["policy"][group][metric]
+            low, high = stats.t.interval(0.95, 1, loc=np.mean(values), scale=stats.sem(values))
+            assert (found["mean"], found["low"], found["high"]) == pytest.approx((np.mean(values), low, high))
+    assert variant["over_seeds"]["lambda_crit"]["mean"] == pytest.approx(
+        np.mean([json.loads(row)["target/lambda_crit"] for run in (folder / "trials").glob("*/metrics.jsonl")
+                 for row in run.read_text().splitlines()[:1]])
+    )  # fmt: skip
+    assert document["failed"] == {}
+
+
+def test_asked_the_same_again_it_runs_nothing(swept, base_run, monkeypatch):
+    folder, _ = swept
+    monkeypatch.setattr(trials, "run_trials", None)
+    before = {path: path.read_bytes() for path in (folder / "out").iterdir()}
+    run = finished(sweep.main, options(sweep.Options, base_run, folder, kind="seeds"))
+    assert {path: path.read_bytes() for path in (folder / "out").iterdir()} == before
+    assert "λ = 16" in run.printed
+
+
+def test_other_seeds_find_the_finished_trials(swept, base_run, monkeypatch, tmp_path):
+    folder, _ = swept
+    monkeypatch.setattr(trials, "_start", None)
+    asked = options(sweep.Options, base_run, folder, kind="seeds", seeds=1, output=tmp_path)
+    finished(sweep.main, asked)
+    document = json.loads((tmp_path / "seeds.json").read_text())
+    assert document["results"]["variants"]["λ = 16"]["seeds"].keys() == {"0"}
+
+
+def test_the_files_can_be_drawn_from_the_numbers_alone(swept, tmp_path):
+    folder, _ = swept
+    shutil.copy(folder / "out" / "seeds.json", tmp_path)
+    finished(sweep.main, sweep.Options(kind="seeds", draw=True, output=tmp_path, base=Path("gone")))
+    for name in ("seeds.md", "seeds.png", "seeds.svg"):
+        assert (tmp_path / name).read_bytes() == (folder / "out" / name).read_bytes()
+
+
+def test_a_trial_that_fails_is_told_on_the_page_and_in_the_exit_code(swept, base_run, tmp_path, capsys, monkeypatch):
+    asked = options(sweep.Options, base_run, swept[0], kind="seeds", output=tmp_path)
+
+    def results() -> tuple[dict, str]:
+        document = json.loads((tmp_path / "seeds.json").read_text())
+        return document["failed"], " ".join(document["results"]["variants"]["λ = 16"]["seeds"])
+
+    with monkeypatch.context() as patch:
+        patch.setattr(trials, "run_trials", lambda asked, **_: {asked[1]: "no luck"})
+        with pytest.raises(SystemExit) as exit_:
+            sweep.main(asked)
+    assert exit_.value.code == 1
+    assert "1 trials failed; the same command tries them again" in capsys.readouterr().err
+    failed, seeds = results()
+    (name,) = failed
+    assert f"- Failed: `{name}`: no luck" in (tmp_path / "seeds.md").read_text()
+    assert seeds == "0"
+    sweep.main(asked)  # tries what failed again
+    assert results() == ({}, "0 1")
+
+
+def test_where_every_trial_fails_nothing_is_written(refused, base_run, tmp_path, monkeypatch):
+    monkeypatch.setattr(trials, "run_trials", lambda asked, **_: dict.fromkeys(asked, "no luck"))
+    told = refused(sweep.main, options(sweep.Options, base_run, tmp_path, kind="seeds"))
+    assert told == "seeds: every trial failed; the first: no luck"
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"kind": "lambda", "values": ["four"]}, "--values: could not convert string to float: 'four'; accepted: "),
+        ({"kind": "lambda", "values": ["0"]}, "--values: found 0; accepted: penalties above 0, such as 4 8 16"),
+        ({"kind": "sampler", "values": ["uniform"]}, "--values: no sampler 'uniform'; known: uniform_clips, "),
+        ({"kind": "targets", "values": ["trun"]}, "targets: no clip 'trun' in the library; did you mean 'turn'?"),
+        ({"kind": "seeds", "seeds": 0}, "--seeds: found 0; accepted: 1 or more"),
+        ({"kind": "seeds", "jobs": 0}, "--jobs: found 0; accepted: 1 or more"),
+        ({"kind": "seeds", "iterations": 0}, "--iterations: found 0; accepted: 1 or more"),
+        ({"kind": "seeds", "targets": ","}, "--targets: no clip named; name at least one to forget, such as "),
+        ({"kind": "seeds", "targets": "sway,turn,nod"}, "targets: all 3 clips of the library; leave at least one"),
+        ({"kind": "seeds", "base": Path("nowhere")}, "nowhere: no such checkpoint folder"),
+        ({"kind": "seeds", "draw": True}, "seeds.json: not measured yet; leave --draw out"),
+    ],
+)
+def test_what_cannot_be_is_told_in_one_line(refused, base_run, tmp_path, given, told):
+    assert told in refused(sweep.main, options(sweep.Options, base_run, tmp_path, **given))
+
+
+def test_a_damaged_file_of_numbers_is_told(refused, base_run, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "seeds.json").write_text("{")
+    told = refused(sweep.main, options(sweep.Options, base_run, tmp_path, kind="seeds"))
+    assert "seeds.json: damaged: " in told
+    assert told.endswith("; remove it to measure again")
+
+
+def test_help_lists_what_a_study_takes(capsys):
+    validity = importlib.import_module("experiments.validity").STUDY
+    commands = (
+        lambda: parse(sweep.Options, "sweep", ["--help"]),
+        lambda: study.main(validity, arguments=["--help"]),
+    )
+    for command in commands:
+        with pytest.raises(SystemExit) as exit_:
+            command()
+        assert exit_.value.code == 0
+        text = capsys.readouterr().out
+        for flag in ("--budget {cpu,paper}", "--seeds INT", "--jobs INT", "--draw", "(default: 3)"):
+            assert flag in text
+
+
+@pytest.fixture(scope="module")
+def watched_run(base_run, tmp_path_factory) -> Run:
+    """An unlearning run that was evaluated on its way, which stands for every trial of a study below."""
+    output = tmp_path_factory.mktemp("runs") / "watched"
+    asked = unlearn.Options(
+        base=base_run.checkpoint(4), targets="turn", iterations=2, episodes=2, output=output, set=[["evaluate_every=1"]]
+    )
+    return finished(unlearn.main, asked)
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_every_study_comes_to_its_page_and_figure(name, base_run, watched_run, tmp_path, monkeypatch):
+    asked_for = []
+
+    def stand_in(asked, **_):
+        for trial in dict.fromkeys(asked):
+            asked_for.append(trial)
+            parse(unlearn.Options, "unlearn", trial.flags)  # every flag is one of the command's
+            if not trial.folder.exists():
+                shutil.copytree(watched_run.folder, trial.folder)
+        return {}
+
+    monkeypatch.setattr(trials, "run_trials", stand_in)
+    module = importlib.import_module(f"experiments.{name}")
+    subject = sweep.targets_study(("turn", "nod"), name) if name == "motion_types" else module.STUDY
+    given = options(study.Options, base_run, tmp_path)
+    run = finished(lambda given: study.conduct(subject, given, "make experiments"), given)
+    out = tmp_path / "out"
+    assert sorted(path.suffix for path in out.glob(f"{name}.*")) == [".json", ".md", ".png", ".svg"]
+    assert asked_for
+    page = (out / f"{name}.md").read_text()
+    assert page.startswith(f"# {subject.title}\n")
+    assert "nan" not in page
+    assert run.printed
+
+
+def test_the_comparison_asks_for_every_method_and_every_sampler_with_and_without_the_wrench(
+    base_run, watched_run, tmp_path, monkeypatch
+):
+    asked_for = {}
+
+    def stand_in(asked, **_):
+        for trial in asked:
+            given = parse(unlearn.Options, "unlearn", trial.flags)
+            asked_for[given.method, given.penalty, given.sampler, given.wrench, given.clips, given.seed] = given
+            if not trial.folder.exists():
+                shutil.copytree(watched_run.folder, trial.folder)
+        return {}
+
+    monkeypatch.setattr(trials, "run_trials", stand_in)
+    module = importlib.import_module("experiments.comparison")
+    given = options(study.Options, base_run, tmp_path, control_iterations=7)
+    finished(lambda given: study.conduct(module.STUDY, given, ""), given)
+    from forgetmimic_jax.unlearning.registry import methods
+
+    assert {key[0] for key in asked_for} == methods().keys()
+    samplers = {key[2:4] for key in asked_for if key[0] == "arft" and key[1] == 16.0}
+    every = (None, "uniform_bins", "frozen", "adaptive")
+    assert samplers == {(sampler, wrench) for sampler in every for wrench in (False, True)}
+    assert {key[4] for key in asked_for if key[0] == "finetune"} == {None, "all"}
+    assert [given.iterations for key, given in asked_for.items() if key[0] == "retrain"] == [7]  # once, on a laptop
+    assert {key[5] for key in asked_for if key[0] != "retrain"} == {0, 1}
