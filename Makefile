@@ -35,7 +35,7 @@ STUDIES = validity comparison penalty heat_map motion_types physical_behaviour t
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help unlearn sweep experiments pretrain evaluate export video motions bench tables test lint format clean
+.PHONY: help unlearn sweep experiments pretrain evaluate export play video motions bench tables test lint format clean
 
 help: ## this list
 	@echo 'make TARGET [VARIABLE=value ...]'
@@ -65,6 +65,10 @@ evaluate: .venv/.installed ## evaluate CHECKPOINT clip by clip
 export: .venv/.installed ## write CHECKPOINT as ONNX for deploy tools, checked in plain MuJoCo
 	$(MODULE).export $(strip --robot $(ROBOT) $(call flag,library,LIBRARY) $(call flag,seed,SEED) \
 		$(call flag,output,OUTPUT) $(call flag,checkpoint,CHECKPOINT) $(call flag,episodes,EPISODES) $(ARGS))
+
+play: .venv/.installed ## watch CHECKPOINT live in a web page, beside its base
+	$(MODULE).play $(strip --robot $(ROBOT) $(call flag,library,LIBRARY) $(call flag,seed,SEED) \
+		$(call flag,checkpoint,CHECKPOINT) $(call flag,base,BASE) $(ARGS))
 
 video: .venv/.installed ## film CHECKPOINT clip by clip, beside its base: MP4, GIF and a page of stills
 	$(MODULE).video $(strip --robot $(ROBOT) $(call flag,library,LIBRARY) $(call flag,seed,SEED) \

@@ -1,0 +1,62 @@
+"""Watch policies live in a web page: `python -m forgetmimic_jax.play --robot g1`."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass
+from pathlib import Path
+
+from forgetmimic_jax.errors import InputError, run_command
+from forgetmimic_jax.options import at_least, parse
+
+
+@dataclass
+class Options:
+    """Serve a web page with the policy, and its base beside it, tracking the clip that you choose.
+
+    The page is for browsers on this machine. Episodes follow the evaluation's protocol on MuJoCo's C engine.
+    """
+
+    robot: str = "g1"
+    """Robot under robots/."""
+    checkpoint: Path | None = None
+    """Checkpoint folder, such as an unlearning run's; the shipped base data/ROBOT/base by default."""
+    base: Path | None = None
+    """For an unlearned checkpoint, the base beside it; the one it started from by default."""
+    seed: int = 0
+    """Seed of the reset noise; the same for every policy."""
+    library: Path | None = None
+    """Folder of clips; the checkpoint's by default."""
+    port: int = 8080
+    """Port of the page; the next free one if it is taken."""
+
+
+def main(options: Options) -> None:
+    """Serve the page until Ctrl-C."""
+    from rich.console import Console
+
+    from forgetmimic_jax import runner
+    from forgetmimic_jax.comparison import load_comparison
+    from forgetmimic_jax.viewing.page import Page
+    from forgetmimic_jax.viewing.playback import Playback
+    from forgetmimic_jax.viewing.side_by_side import SideBySide
+
+    at_least(0, "--seed", options.seed)
+    if not 1024 <= options.port <= 65535:
+        raise InputError(f"--port: found {options.port}; accepted: 1024 to 65535")
+    path = options.checkpoint or runner.base_folder(options.robot)
+    compared = load_comparison(path, robot=options.robot, base=options.base, library=options.library, physics="native")
+    robot, library = compared.setup.robot, compared.setup.library
+    stage = SideBySide(compared.setup.config, robot, library, compared.policies)
+    first = library.names.index(compared.targets[0]) if compared.targets else 0
+    playback = Playback(stage, robot, first, seed=options.seed)
+    playback.advance()  # compiles
+    playback.begin(first)
+    page = Page(playback, robot, stage.names, library.names, compared.targets, port=options.port)
+    Console().print(f"Open {page.address} in a browser; Ctrl-C ends it.", highlight=False)
+    with contextlib.closing(page), contextlib.suppress(KeyboardInterrupt):
+        page.run()
+
+
+if __name__ == "__main__":
+    run_command(lambda: main(parse(Options, "play")))

@@ -1,0 +1,319 @@
+"""A web page to play with policies: robots side by side on moving floors, their reference, controls and live plots."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import queue
+import time
+from collections.abc import Callable, Mapping, Sequence
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+import viser
+from scipy.spatial.transform import Rotation
+
+from forgetmimic_jax.robot import Robot
+from forgetmimic_jax.viewing.offscreen import drawing_model
+from forgetmimic_jax.viewing.playback import Playback
+from forgetmimic_jax.viewing.shapes import UNIT_MESHES, Shapes, shapes
+
+PICTURES_PER_SECOND, PLOTS_PER_SECOND = 25.0, 5.0
+LANE = (2.6, 2.0)  # length and width of a robot's piece of floor, m; the robot stays in its middle
+LANE_GAP, LINE_SPACING = 0.2, 0.5  # m
+GHOST_OPACITY, GHOST_SHARE, GHOST_TINT = 0.3, 0.5, np.array([64, 166, 115])
+GHOST_REACH = 1.2  # m from the robot, beyond which the reference is hidden: it would stand on another's floor
+FLOOR, LINE, RED = (205, 211, 219), (168, 177, 189), (214, 30, 40)
+CURVES = ("#1f77b4", "#ff7f0e", "#2ca02c")  # base, unlearned, reference
+
+
+class Page:
+    """Serves the page on this machine and moves what it shows. Simulation and drawing happen on the caller's thread."""
+
+    def __init__(
+        self,
+        playback: Playback,
+        robot: Robot,
+        policies: Sequence[str],
+        clips: Sequence[str],
+        targets: Sequence[str],
+        *,
+        port: int,
+    ):
+        self._playback, self._policies = playback, list(policies)
+        self._model, self._data = robot.model, mujoco.MjData(robot.model)
+        self._todo: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()  # what the page's visitors asked for
+        self._random = np.random.default_rng()
+        self._playing, self._due = True, time.monotonic()
+        with contextlib.redirect_stdout(io.StringIO()):  # viser's own announcement
+            self._server = viser.ViserServer(host="127.0.0.1", port=port, label="ForgetMimic", verbose=False)
+        self.address = f"http://127.0.0.1:{self._server.get_port()}"
+        self._menu = {f"{clip} (to be forgotten)" if clip in targets else clip: i for i, clip in enumerate(clips)}
+        self._build_scene(shapes(drawing_model(robot.name, 16, 16)))
+        self._build_controls()
+        self._show(plots=True)
+
+    def close(self) -> None:
+        """Stop serving."""
+        with contextlib.redirect_stdout(io.StringIO()):
+            self._server.stop()
+
+    def run(self, until: Callable[[], bool] = lambda: False) -> None:
+        """Play in real time until `until()`."""
+        shown = plotted = 0.0
+        while not until():
+            changed = self._obey()
+            now = time.monotonic()
+            if self._playing and now >= self._due:
+                self._advance()
+                self._due += self._playback.control_step / self._speed.value
+                self._due = max(self._due, now - 0.1)  # too slow a machine plays slowly, and does not catch up in leaps
+                changed = True
+            if changed and (not self._playing or now - shown >= 1.0 / PICTURES_PER_SECOND):
+                plots = now - plotted >= 1.0 / PLOTS_PER_SECOND or not self._playing
+                self._show(plots)
+                shown, plotted = now, now if plots else plotted
+            time.sleep(max(0.0, min(self._due - time.monotonic(), 0.02)) if self._playing else 0.02)
+
+    def _advance(self) -> None:
+        if not self._playback.done:
+            self._playback.advance()
+        elif self._repeat.value:
+            self._playback.begin(self._playback.clip)
+
+    def _obey(self) -> bool:
+        """Do what was asked for since the last time; whether there was anything."""
+        asked = not self._todo.empty()
+        while not self._todo.empty():
+            self._todo.get()()
+        return asked
+
+    # The scene
+
+    def _build_scene(self, robot: Mapping[str, Shapes]) -> None:
+        scene = self._server.scene
+        scene.set_background_image(np.full((1, 1, 3), 244, np.uint8))
+        self._lanes = [
+            _Lane(scene, name, robot, (i - (len(self._policies) - 1) / 2.0) * (LANE[1] + LANE_GAP))
+            for i, name in enumerate(self._policies)
+        ]
+        camera = self._server.initial_camera
+        camera.position, camera.look_at = (3.4, -0.9, 1.5), (0.0, 0.0, 0.62)
+
+    def _show(self, plots: bool) -> None:
+        playback = self._playback
+        heading = _yaw(playback.start)
+        reference = self._poses(playback.reference)
+        with self._server.atomic():
+            for lane, qpos, ended in zip(self._lanes, playback.qpos, playback.ended, strict=True):
+                fell = None if ended is None else ended * playback.control_step
+                shown = reference if self._ghost.value else None
+                lane.show(qpos, self._poses(qpos), shown, playback.reference, heading, fell)
+            if plots:
+                self._show_plots()
+        self._server.flush()
+
+    def _poses(self, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Every body's position [body, 3] and orientation [body, 4]."""
+        self._data.qpos[:] = qpos
+        mujoco.mj_kinematics(self._model, self._data)
+        return self._data.xpos.copy(), self._data.xquat.copy()
+
+    # The controls and plots
+
+    def _build_controls(self) -> None:
+        gui, playback = self._server.gui, self._playback
+        gui.configure_theme(show_logo=False, show_share_button=False)
+        gui.main_panel.dock_right()
+        names = list(self._menu)
+        menu = gui.add_dropdown("Clip", names, initial_value=names[playback.clip])
+        keys = gui.add_button_group("Time", ("Play", "Pause", "Step", "Restart"), hint="a step is one control step")
+        self._speed = gui.add_slider("Speed", 0.1, 2.0, 0.1, 1.0, hint="1 is real time")
+        strength = gui.add_slider("Push (m/s)", 0.2, 3.0, 0.2, 1.0, hint="what a push adds to the pelvis's velocity")
+        shove = gui.add_button("Push", hint="the same for every robot, in a random direction")
+        self._ghost = gui.add_checkbox("Show the reference", True)
+        self._repeat = gui.add_checkbox("Repeat", True)
+        self._status = gui.add_markdown("")
+        empty = np.zeros(1)
+        curves = [
+            viser.uplot.Series(label=name, stroke=colour, width=2)
+            for name, colour in zip(self._policies, CURVES, strict=False)
+        ]
+        time_axis = viser.uplot.Series(label="s")
+        self._tracking_plot = gui.add_uplot(
+            (empty,) * (1 + len(curves)),
+            (time_axis, *curves),
+            title="Tracking reward",
+            scales={"x": {"time": False}, "y": {"range": (0.0, 1.05)}},
+            height=180,
+        )
+        self._height_plot = gui.add_uplot(
+            (empty,) * (2 + len(curves)),
+            (time_axis, *curves, viser.uplot.Series(label="reference", stroke=CURVES[2], width=1)),
+            title="Height of the pelvis (m)",
+            scales={"x": {"time": False}, "y": {"range": (0.0, 1.2)}},
+            height=180,
+        )
+
+        menu.on_update(self._ask(lambda: playback.begin(self._menu[menu.value])))
+        actions: dict[str, Callable[[], None]] = {
+            "Play": lambda: self._set_playing(True),
+            "Pause": lambda: self._set_playing(False),
+            "Step": self._single_step,
+            "Restart": lambda: playback.begin(playback.clip),
+        }
+        keys.on_click(lambda event: self._todo.put(actions[event.target.value]))
+        shove.on_click(self._ask(lambda: self._push(strength.value)))
+        self._ghost.on_update(self._ask(lambda: None))
+
+    def _ask(self, action: Callable[[], None]) -> Callable[[object], None]:
+        """A handler that leaves `action` to the thread that simulates."""
+        return lambda _event: self._todo.put(action)
+
+    def _set_playing(self, playing: bool) -> None:
+        self._playing, self._due = playing, time.monotonic()
+
+    def _single_step(self) -> None:
+        self._set_playing(False)
+        self._playback.advance()
+
+    def _push(self, speed: float) -> None:
+        angle = self._random.uniform(0.0, 2.0 * np.pi)
+        self._playback.push(speed * np.array([np.cos(angle), np.sin(angle), 0.0]))
+
+    def _show_plots(self) -> None:
+        playback = self._playback
+        now = playback.step * playback.control_step
+        lines = [
+            f"{now:.2f} of {playback.horizon * playback.control_step:.2f} s. Mean tracking reward, 0 after a fall:"
+        ]
+        tracking = np.array(playback.tracking).reshape(-1, len(self._policies))
+        for policy, ended in enumerate(playback.ended):
+            mean = f"{tracking[:, policy].mean():.2f}" if playback.step else "–"
+            fell = "" if ended is None else f", fell at {ended * playback.control_step:.2f} s"
+            lines.append(f"- {self._policies[policy]}: **{mean}**{fell}")
+        self._status.content = "\n".join(lines)
+        times = np.arange(playback.step + 1) * playback.control_step
+        if playback.step:
+            self._tracking_plot.data = _columns(times[1:], tracking)
+        self._height_plot.data = _columns(times, np.array(playback.height))
+
+
+class _Lane:
+    """One policy's piece of floor with its robot in the middle, whose ways the lines on the floor show."""
+
+    def __init__(self, scene: viser.SceneApi, name: str, robot: Mapping[str, Shapes], y: float):
+        root = f"/{name}"
+        length, width = LANE
+        scene.add_frame(root, show_axes=False, position=(0.0, y, 0.0))
+        scene.add_grid(
+            f"{root}/floor",
+            length,
+            width,
+            cell_thickness=0.0,
+            section_thickness=0.0,
+            plane_color=FLOOR,
+            plane_opacity=1.0,
+            shadow_opacity=0.35,
+        )
+        self._across = scene.add_line_segments(f"{root}/across", _lines(length, width), LINE, thickness=0.008)
+        along = _lines(width, length)[..., [1, 0, 2]]
+        self._along = scene.add_line_segments(f"{root}/along", along, LINE, thickness=0.008)
+        corners = np.array([[x, y, 0.01] for x, y in ((1, 1), (1, -1), (-1, -1), (-1, 1))]) * [length / 2, width / 2, 1]
+        border = np.stack([corners, np.roll(corners, 1, axis=0)], axis=1)
+        self._alarm = scene.add_line_segments(f"{root}/alarm", border, RED, thickness=0.05, visible=False)
+        self._label = scene.add_label(
+            f"{root}/label", name, position=(0.0, 0.0, 1.62), anchor="bottom-center", font_screen_scale=1.4
+        )
+        self._name = name
+        self._world = scene.add_frame(f"{root}/world", show_axes=False)
+        self._robot = _Figure(scene, f"{root}/world/robot", robot)
+        self._ghost = _Figure(scene, f"{root}/world/reference", robot, ghost=True)
+
+    def show(
+        self,
+        qpos: np.ndarray,
+        poses: tuple[np.ndarray, np.ndarray],
+        ghost: tuple[np.ndarray, np.ndarray] | None,
+        reference: np.ndarray,
+        heading: float,
+        fell: float | None,
+    ) -> None:
+        """Move everything.
+
+        Args:
+            qpos: [nq] of the robot.
+            poses: its bodies' positions and orientations.
+            ghost: those of the reference; None: not to be seen.
+            reference: [nq] of the reference.
+            heading: yaw that is turned towards the viewer, rad.
+            fell: when the episode ended, s; None: it has not.
+        """
+        turn = Rotation.from_euler("z", -heading)
+        centre = turn.apply([*qpos[:2], 0.0])
+        self._world.wxyz = turn.as_quat(scalar_first=True)
+        self._world.position = -centre
+        self._across.position = (-centre[0] % LINE_SPACING, 0.0, 0.0)
+        self._along.position = (0.0, -centre[1] % LINE_SPACING, 0.0)
+        self._robot.show(poses)
+        near = ghost is not None and bool(np.linalg.norm(reference[:2] - qpos[:2]) < GHOST_REACH)
+        self._ghost.visible(near)
+        if near and ghost is not None:
+            self._ghost.show(ghost)
+        self._alarm.visible = fell is not None
+        self._label.text = self._name if fell is None else f"{self._name}: fell at {fell:.2f} s"
+
+
+class _Figure:
+    """A robot's shapes, all of a kind moved at once."""
+
+    def __init__(self, scene: viser.SceneApi, root: str, robot: Mapping[str, Shapes], *, ghost: bool = False):
+        self._root = scene.add_frame(root, show_axes=False)
+        self._kinds = []
+        for kind, found in robot.items():
+            colours = GHOST_SHARE * found.colour + (1.0 - GHOST_SHARE) * GHOST_TINT if ghost else found.colour
+            meshes = scene.add_batched_meshes_simple(
+                f"{root}/{kind}",
+                np.asarray(UNIT_MESHES[kind].vertices),
+                UNIT_MESHES[kind].faces,
+                found.rotation.as_quat(scalar_first=True),
+                found.position,
+                batched_scales=found.half_size,
+                batched_colors=np.asarray(colours, np.uint8),
+                lod="off",
+                opacity=GHOST_OPACITY if ghost else None,
+                cast_shadow=not ghost,
+                receive_shadow=not ghost,
+            )
+            self._kinds.append((found, meshes))
+
+    def show(self, poses: tuple[np.ndarray, np.ndarray]) -> None:
+        """Move everything to where the bodies' positions [body, 3] and orientations [body, 4] have it."""
+        for found, meshes in self._kinds:
+            positions, orientations = found.placed(*poses)
+            meshes.batched_positions = positions.astype(np.float32)
+            meshes.batched_wxyzs = orientations.astype(np.float32)
+
+    def visible(self, visible: bool) -> None:
+        """Show or hide the whole figure."""
+        self._root.visible = visible
+
+
+def _columns(times: np.ndarray, curves: np.ndarray) -> tuple[npt.NDArray[np.float64], ...]:
+    """Times [step] and curves [step, curve] as a plot takes them."""
+    return tuple(np.asarray(column, np.float64) for column in (times, *curves.T))
+
+
+def _lines(length: float, width: float) -> np.ndarray:
+    """Lines [line, 2, 3] over a floor's width, LINE_SPACING apart; moved on by less than that they stay on it."""
+    x = np.arange(-length / 2.0, length / 2.0 - LINE_SPACING / 2.0, LINE_SPACING)
+    return np.stack(
+        [np.stack([x, np.full_like(x, y), np.full_like(x, 0.001)], axis=-1) for y in (-width / 2, width / 2)], 1
+    )
+
+
+def _yaw(qpos: np.ndarray) -> float:
+    """Direction of the root's x axis over the floor, rad."""
+    forward = Rotation.from_quat(qpos[3:7], scalar_first=True).apply([1.0, 0.0, 0.0])
+    return float(np.arctan2(forward[1], forward[0]))

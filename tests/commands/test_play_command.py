@@ -1,0 +1,41 @@
+from pathlib import Path
+
+import pytest
+
+from forgetmimic_jax import play
+from forgetmimic_jax.viewing import page
+
+
+@pytest.fixture
+def options(base_run):
+    def options(**given) -> play.Options:
+        return play.Options(**{"checkpoint": base_run.checkpoint(4)} | given)
+
+    return options
+
+
+def test_base_and_unlearned_policy_are_served_from_the_first_target_on(unlearned_run, monkeypatch, capsys):
+    seen = []
+
+    def run(self) -> None:
+        seen.append((self._policies, list(self._menu), self._playback.clip, self._playback.step))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(page.Page, "run", run)
+    play.main(play.Options(checkpoint=unlearned_run.checkpoint(2), port=18180))
+    assert seen == [(["base", "unlearned"], ["sway", "turn (to be forgotten)", "nod"], 1, 0)]
+    assert "Open http://127.0.0.1:18180 in a browser; Ctrl-C ends it." in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"robot": "gg1", "checkpoint": None}, "robot 'gg1': no robots/gg1/gg1.yaml; did you mean 'g1'?"),
+        ({"checkpoint": Path("nowhere")}, "nowhere: no such checkpoint folder"),
+        ({"port": 80}, "--port: found 80; accepted: 1024 to 65535"),
+        ({"seed": -1}, "--seed: found -1; accepted: 0 or more"),
+        ({"library": Path("nowhere")}, "nowhere/manifest.json: not found; a library is a folder with manifest.json"),
+    ],
+)
+def test_what_cannot_be_is_told_in_one_line(refused, options, given, told):
+    assert refused(play.main, options(**given)) == told

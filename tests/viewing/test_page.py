@@ -1,0 +1,132 @@
+"""The page in a headless browser, and without one what its controls do."""
+
+import io
+import shutil
+import threading
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from forgetmimic_jax.viewing.page import Page
+from forgetmimic_jax.viewing.playback import Playback
+from forgetmimic_jax.viewing.side_by_side import SideBySide
+
+SIZE = {"width": 640, "height": 420}
+SCENE = {"x": 0, "y": 0, "width": 310, "height": 420}  # what the panel of controls leaves
+FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking"]
+PATIENCE = 240_000  # ms: a browser that draws in software on a busy machine is slow
+
+
+@pytest.fixture(scope="module")
+def stage(robot, library, tiny_config, policy) -> SideBySide:
+    return SideBySide(tiny_config, robot, library, {"base": policy, "unlearned": None})
+
+
+@pytest.fixture
+def page(stage, robot, library):
+    page = Page(Playback(stage, robot), robot, stage.names, library.names, ["turn"], port=18080)
+    yield page
+    page.close()
+
+
+@pytest.fixture(scope="module")
+def browser():
+    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if chromium is None:
+        pytest.skip("no Chromium on this machine")
+    playwright = pytest.importorskip("playwright.sync_api", reason="the package playwright is not installed")
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=chromium, args=FLAGS)
+        yield browser
+        browser.close()
+
+
+def picture(view) -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(view.screenshot(clip=SCENE, timeout=PATIENCE))).convert("RGB"), int)
+
+
+def test_the_page_opens_a_clip_is_chosen_and_both_robots_move(page, browser, tmp_path):
+    # A browser that draws in software has little time for anything else.
+    page._set_playing(False)
+    page._server.scene.configure_default_lights(cast_shadow=False)
+    stop = threading.Event()
+    playing = threading.Thread(target=page.run, args=(stop.is_set,))
+    playing.start()
+    try:
+        view = browser.new_page(viewport=SIZE, device_scale_factor=0.5)
+        view.set_default_timeout(PATIENCE)
+        elsewhere = []
+        view.on("request", lambda request: elsewhere.append(request.url))
+        view.goto(page.address)
+        view.get_by_text("Tracking reward", exact=True).wait_for()
+        # Events rather than clicks, which wait for the page to hold still: on a busy machine that takes minutes.
+        view.get_by_role("combobox").first.dispatch_event("click")
+        view.get_by_role("option", name="turn (to be forgotten)").dispatch_event("click")
+        view.get_by_text("0.00 of 0.80 s").wait_for()
+        view.wait_for_timeout(2000)  # the scene fades in
+        before = picture(view)
+        for _ in range(10):
+            view.get_by_role("button", name="Step", exact=True).dispatch_event("click")
+        view.get_by_text("0.20 of 0.80 s").wait_for()
+        view.wait_for_timeout(1000)
+        after = picture(view)
+        view.screenshot(path=tmp_path / "page.png", timeout=PATIENCE)
+    finally:
+        stop.set()
+        playing.join()
+    for half in np.split(np.abs(after - before).sum(-1) > 60, 2, axis=1):
+        assert half.sum() > 15, "a robot moved"
+    assert [url for url in elsewhere if not url.startswith((page.address, "data:", "blob:"))] == []
+
+
+def test_the_controls_do_what_they_say(page, library):
+    playback = page._playback
+    page._single_step()
+    assert (playback.step, page._playing) == (1, False)
+    velocity = np.asarray(playback._state.physics.qvel)[:, :2]
+    page._push(2.0)
+    gained = np.asarray(playback._state.physics.qvel)[:, :2] - velocity
+    np.testing.assert_allclose(np.linalg.norm(gained, axis=1), 2.0, rtol=1e-5)
+    np.testing.assert_allclose(gained[0], gained[1], atol=1e-6)
+    assert list(page._menu) == ["sway", "turn (to be forgotten)"]
+    page._ask(lambda: playback.begin(1))(None)
+    assert playback.clip == 0, "what a visitor asks for waits for the thread that simulates"
+    assert page._obey()
+    assert (playback.clip, playback.step) == (1, 0)
+    assert not page._obey()
+
+
+def test_it_repeats_only_if_asked_to(page):
+    playback = page._playback
+    playback.step = playback.horizon
+    page._repeat.value = False
+    page._advance()
+    assert playback.step == playback.horizon
+    page._repeat.value = True
+    page._advance()
+    assert playback.step == 0
+
+
+def test_an_end_shows_as_a_red_frame_and_in_words(page):
+    playback = page._playback
+    playback.step, playback.tracking = 2, [np.array([0.8, 0.8]), np.array([0.6, 0.0])]
+    playback.height *= 3
+    playback.ended = [None, 1]
+    page._show(plots=True)
+    assert [lane._alarm.visible for lane in page._lanes] == [False, True]
+    assert [lane._label.text for lane in page._lanes] == ["base", "unlearned: fell at 0.02 s"]
+    assert page._status.content.splitlines()[1:] == ["- base: **0.70**", "- unlearned: **0.40**, fell at 0.02 s"]
+
+
+def test_a_robot_stays_in_the_middle_of_its_floor_facing_the_viewer(page):
+    from scipy.spatial.transform import Rotation
+
+    lane, qpos = page._lanes[0], page._playback.qpos[0].copy()
+    qpos[:2] = [3.0, -7.0]
+    quarter = np.pi / 2.0
+    lane.show(qpos, page._poses(qpos), None, qpos, quarter, None)
+    turn = Rotation.from_quat(lane._world.wxyz, scalar_first=True)
+    np.testing.assert_allclose(turn.apply([3.0, -7.0, 0.0]) + lane._world.position, 0.0, atol=1e-6)
+    np.testing.assert_allclose(turn.apply([0.0, 1.0, 0.0]), [1.0, 0.0, 0.0], atol=1e-6)  # heading along y
+    assert not lane._ghost._root.visible
