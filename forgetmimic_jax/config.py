@@ -137,7 +137,7 @@ class PPOConfig:
     epochs: int = 5
     minibatches: int = 4
     learning_rate: float = 1e-3
-    schedule: Literal["adaptive", "fixed"] = "adaptive"
+    schedule: Literal["adaptive", "adaptive_iteration", "fixed"] = "adaptive"  # by KL: every minibatch, or iteration
     target_kl: float = 0.01
     min_learning_rate: float = 1e-5
     max_learning_rate: float = 1e-2
@@ -202,18 +202,20 @@ def preset(name: str) -> Config:
             checkpoint_every=200,
             evaluate_every=500,
             noise=dataclasses.replace(paper.noise, enabled=False),
-            sampling=dataclasses.replace(paper.sampling, bin_seconds=1.0),
+            sampling=dataclasses.replace(paper.sampling, bin_seconds=1.0, prior="clips", uniform_ratio=0.3),
             wrench=dataclasses.replace(paper.wrench, max_gain=0.0),
             ppo=dataclasses.replace(
                 paper.ppo,
-                num_envs=256,
-                num_steps=16,
+                num_envs=512,
+                branches=4,
+                num_steps=8,
                 epochs=4,
-                learning_rate=3e-4,
-                schedule="fixed",
+                learning_rate=2e-4,
+                schedule="adaptive_iteration",
+                target_kl=0.03,
                 discount=0.97,
-                gae_lambda=0.9,
-                entropy_cost=0.003,
+                gae_lambda=0.7,
+                entropy_cost=0.006,
                 actor_layers=(256, 256, 128),
                 critic_layers=(256, 256, 128),
             ),

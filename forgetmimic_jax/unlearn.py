@@ -67,6 +67,7 @@ class Options:
 
 
 ITERATIONS = {"cpu": 400, "paper": 1000}
+PACE = ("schedule", "target_kl", "min_learning_rate", "max_learning_rate")
 
 
 def main(options: Options) -> None:
@@ -117,6 +118,9 @@ def _config_of_new_run(options: Options) -> Config:
 
     info = checkpoint.read_info(options.base or runner.base_folder(options.robot))
     base = config = info.config
+    # A base's last training may have been slowed down to settle it; forgetting is to go at the preset's pace.
+    pace: dict[str, Any] = {name: getattr(preset(base.preset).ppo, name) for name in PACE}
+    config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, **pace))
     if options.preset:
         config = preset(options.preset)
         # The network is the base's, and so are the bins of its failure levels: they are what unlearning starts from.

@@ -55,7 +55,7 @@ def library(robot) -> MotionLibrary:
 
 @pytest.fixture(scope="session")
 def tiny_config() -> Config:
-    """The cpu preset with 8 environments, 4 steps and networks of a few units, on the C engine."""
+    """Plain PPO of the cpu preset with 8 environments, 4 steps and networks of a few units, on the C engine."""
     config = preset("cpu")
     return dataclasses.replace(
         config,
@@ -64,9 +64,11 @@ def tiny_config() -> Config:
         ppo=dataclasses.replace(
             config.ppo,
             num_envs=8,
+            branches=1,
             num_steps=4,
             epochs=2,
             minibatches=2,
+            schedule="fixed",
             actor_layers=(16, 16),
             critic_layers=(16,),
         ),

@@ -113,7 +113,10 @@ def test_the_hash_does_not_see_how_long_or_how_often(name):
         ({"ppo": {"clip_value": 1}}, "here: ppo: clip_value: expected bool, found 1"),
         ({"ppo": {"actor_layers": 256}}, "here: ppo: actor_layers: expected a list, found 256"),
         ({"ppo": {"actor_layers": [256, "x"]}}, "here: ppo: actor_layers: expected int, found 'x'"),
-        ({"ppo": {"schedule": "cosine"}}, "here: ppo: schedule: found 'cosine', accepted: adaptive, fixed"),
+        (
+            {"ppo": {"schedule": "cosine"}},
+            "here: ppo: schedule: found 'cosine', accepted: adaptive, adaptive_iteration, fixed",
+        ),
         ({"unlearn": {"targets": "punch"}}, "here: unlearn: targets: expected a list, found 'punch'"),
         ({"library": 5}, "here: library: expected str, found 5"),
     ],

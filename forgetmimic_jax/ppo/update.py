@@ -231,6 +231,10 @@ def improve(
         epoch, carry, jax.random.split(epoch_key, config.epochs)
     )
     metrics = {name: value.mean() for name, value in metrics.items()} | {"kl_final": metrics["kl"][-1].mean()}
+    if config.schedule == "adaptive_iteration":
+        learning_rate = adapt_learning_rate(
+            learning_rate, metrics["kl_final"], config.target_kl, config.min_learning_rate, config.max_learning_rate
+        )
     metrics["learning_rate"] = learning_rate
     metrics["std"] = jnp.exp(old_log_std).mean()
     new_policy = dataclasses.replace(policy, actor=params[0], critic=params[1])

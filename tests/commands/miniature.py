@@ -13,8 +13,21 @@ from forgetmimic_jax.state import TrainState
 
 # The assistive wrench is on, so that unlearning has something to turn off.
 TINY = [
-    *("physics.engine=native", "evaluate_every=0", "checkpoint_every=2", "sampling.bin_seconds=0.4"),
-    *("wrench.max_gain=0.5", "ppo.num_envs=8", "ppo.num_steps=4", "ppo.epochs=2", "ppo.minibatches=2"),
+    *(
+        "physics.engine=native",
+        "evaluate_every=0",
+        "checkpoint_every=2",
+        "sampling.bin_seconds=0.4",
+        "sampling.prior=bins",
+    ),
+    *(
+        "wrench.max_gain=0.5",
+        "ppo.num_envs=8",
+        "ppo.branches=2",
+        "ppo.num_steps=4",
+        "ppo.epochs=2",
+        "ppo.minibatches=2",
+    ),
     *("ppo.actor_layers=[16]", "ppo.critic_layers=[16]"),
 ]
 

@@ -113,7 +113,7 @@ def test_an_iteration_learns_and_normalises(run):
         assert (old != new).any()
     assert after.policy.actor_normalizer.count == after.policy.critic_normalizer.count == ENVS * STEPS
     assert finite(metrics)
-    assert float(metrics["learning_rate"]) == float(before.learning_rate)  # the cpu preset's rate is fixed
+    assert float(metrics["learning_rate"]) == float(before.learning_rate)
 
 
 def test_a_diverged_environment_is_counted_and_reaches_neither_metrics_nor_networks(run):
@@ -269,6 +269,17 @@ def test_the_adaptive_schedule_slows_down_when_the_policy_moves_too_far(problem)
     )
     assert float(metrics["kl_final"]) > 0.02
     assert float(after.learning_rate) < 1e-2
+
+
+def test_once_an_iteration_the_schedule_follows_the_last_epochs_kl(problem):
+    env, state, batch, advantage, target = problem
+    for learning_rate, factor in ((1e-2, 1 / 1.5), (1e-5, 1.5)):
+        ppo = dataclasses.replace(env.config.ppo, schedule="adaptive_iteration", epochs=4, target_kl=0.01)
+        slow = SimpleNamespace(config=dataclasses.replace(env.config, ppo=ppo), robot=env.robot, assets=env.assets)
+        start = dataclasses.replace(state, learning_rate=jnp.float32(learning_rate))
+        after, metrics = improved(slow, start, batch, advantage, target)
+        assert (float(metrics["kl_final"]) > 0.02) == (factor < 1)
+        assert float(after.learning_rate) == pytest.approx(learning_rate * factor)
 
 
 def test_ended_episodes_and_steps_are_counted_clip_by_clip(run):
