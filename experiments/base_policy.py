@@ -33,8 +33,8 @@ One seed each, on cores shared with other work, so environment steps are compare
 
 Mean episode length (control steps, exploration noise included) on the twelve G1 clips by environment steps. All but the
 last row: a first version of the clip library (later refined) with `{shared}`;
-those with `initial_std=0.5` ran before the root-velocity and torque terms of the reward were corrected. A difference of a
-step or two means nothing.
+those with `initial_std=0.5` ran before the root-velocity and torque terms of the reward were corrected. A difference
+of a step or two means nothing.
 
 {table}
 
@@ -42,8 +42,8 @@ step or two means nothing.
 
 A wider exploration noise helps most (a joint hardly moves under narrow noise at 50 Hz, so little is learned from it),
 although the noise itself shortens the episodes counted here; randomisation costs nothing measurable this early; half
-the rollout with the same number of gradient steps a sample changes little; nor do branches, this early. Noise correlated
-from step to step was tried as well and tracked worse at twice the KL, so it is not in the code.
+the rollout with the same number of gradient steps a sample changes little; nor do branches, this early. Correlated
+noise was tried as well and tracked worse at twice the KL, so it is not in the code.
 
 ## Going on from a trained policy
 
