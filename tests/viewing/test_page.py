@@ -13,7 +13,7 @@ from forgetmimic_jax.viewing.playback import Playback
 from forgetmimic_jax.viewing.side_by_side import SideBySide
 
 SIZE = {"width": 640, "height": 420}
-SCENE = {"x": 0, "y": 0, "width": 310, "height": 420}  # what the panel of controls leaves
+SCENE = {"x": 0, "y": 0, "width": 308, "height": 420}  # what the panel of controls leaves
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking"]
 PATIENCE = 240_000  # ms: a browser that draws in software on a busy machine is slow
 
@@ -66,9 +66,9 @@ def test_the_page_opens_a_clip_is_chosen_and_both_robots_move(page, browser, tmp
         view.get_by_text("0.00 of 0.80 s").wait_for()
         view.wait_for_timeout(2000)  # the scene fades in
         before = picture(view)
-        for _ in range(10):
+        for step in range(1, 11):
             view.get_by_role("button", name="Step", exact=True).dispatch_event("click")
-        view.get_by_text("0.20 of 0.80 s").wait_for()
+            view.get_by_text(f"{0.02 * step:.2f} of 0.80 s").wait_for()  # the browser merges events in quick succession
         view.wait_for_timeout(1000)
         after = picture(view)
         view.screenshot(path=tmp_path / "page.png", timeout=PATIENCE)
