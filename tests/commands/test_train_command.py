@@ -141,7 +141,10 @@ def test_settings_given_twice_add_up():
         ({"set": [["ppo.epochs=many"]]}, "--set: ppo: epochs: expected int, found 'many'"),
         ({"set": [["ppo.epochs=1.5"]]}, "--set: ppo: epochs: expected int, found 1.5"),
         ({"set": [["ppo.epochs=[1"]]}, "--set ppo.epochs=[1: '[1' is no value; expected a number, a word or [a, list]"),
-        ({"set": [["ppo.schedule=linear"]]}, "--set: ppo: schedule: found 'linear', accepted: adaptive, adaptive_iteration, fixed"),
+        (
+            {"set": [["ppo.schedule=linear"]]},
+            "--set: ppo: schedule: found 'linear', accepted: adaptive, adaptive_iteration, fixed",
+        ),
         ({"set": [[*TINY, "ppo.num_envs=0"]]}, "ppo.num_envs: found 0; accepted: 1 or more"),
         (
             {"set": [[*TINY, "ppo.minibatches=33"]]},
