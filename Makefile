@@ -15,6 +15,7 @@
 ## CHECKPOINT   the policy to evaluate, export, play or film
 ## CLIPS        clips to film, comma-separated (default: all)
 ## EPISODES     episodes a clip in an evaluation (default: 20)
+## RUN          folder of the run to report on
 ## OUTPUT       folder for the results (default: a folder under runs/)
 ## RESUME       1 goes on with the run in OUTPUT
 ## SWEEP        lambda, targets, sampler or seeds (default: lambda)
@@ -35,7 +36,7 @@ STUDIES = validity comparison penalty heat_map motion_types physical_behaviour t
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help unlearn sweep experiments pretrain evaluate export play video motions bench tables test lint format clean
+.PHONY: help unlearn sweep experiments pretrain evaluate export play report video motions bench tables test lint format clean
 
 help: ## this list
 	@echo 'make TARGET [VARIABLE=value ...]'
@@ -74,6 +75,9 @@ video: .venv/.installed ## film CHECKPOINT clip by clip, beside its base: MP4, G
 	$(MODULE).video $(strip --robot $(ROBOT) $(call flag,library,LIBRARY) $(call flag,seed,SEED) \
 		$(call flag,output,OUTPUT) $(call flag,checkpoint,CHECKPOINT) $(call flag,base,BASE) \
 		$(call flag,clips,CLIPS) $(ARGS))
+
+report: .venv/.installed ## one HTML page that tells of the unlearning run in RUN
+	$(MODULE).report $(strip $(call flag,run,RUN) $(call flag,output,OUTPUT) $(ARGS))
 
 motions: .venv/.installed ## make a library from your own clips (ARGS=--help says how)
 	$(MODULE).motions $(strip --robot $(ROBOT) $(ARGS))

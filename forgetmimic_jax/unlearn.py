@@ -80,7 +80,7 @@ def main(options: Options) -> None:
     at_least(1, "--episodes", options.episodes)
     output = options.output or runner.default_folder(f"unlearn-{options.robot}", resume=options.resume)
     runner.prepare_folder(output, resume=options.resume)
-    config = _config_of_run(options, output) if options.resume else _config_of_new_run(options)
+    config = _config_of_run(options, output) if options.resume else config_of_new_run(options)
     config = override(replace_given(config, iterations=options.iterations), itertools.chain(*options.set))
     if not config.unlearn.targets:
         raise InputError("--targets: no clip named; name at least one to forget, such as --targets punch,kick")
@@ -111,7 +111,7 @@ def main(options: Options) -> None:
     closing(files, f"make evaluate ROBOT={config.robot} CHECKPOINT={path} EPISODES=100")
 
 
-def _config_of_new_run(options: Options) -> Config:
+def config_of_new_run(options: Options) -> Config:
     """The base's settings, or the preset's, as the method and the flags change them."""
     from forgetmimic_jax import checkpoint, runner
     from forgetmimic_jax.unlearning.registry import find_method, unlearning_config

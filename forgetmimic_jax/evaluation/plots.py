@@ -1,10 +1,13 @@
-"""Figures of evaluation.json, metrics.jsonl and studies. matplotlib is loaded only when a figure is drawn."""
+"""Figures of evaluation.json, metrics.jsonl and studies. matplotlib is loaded only when a figure is drawn.
+
+`path` is where a figure goes: a file, whose suffix says the format, or a text buffer, which gets SVG.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 from forgetmimic_jax.errors import InputError
 from forgetmimic_jax.evaluation.statistics import Estimate
@@ -16,12 +19,16 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 STEPS = ("iteration", "environment_steps")
+GROUP_COLOURS = {"target": "tab:red", "kept": "tab:blue"}
 
 
 def clip_bars(
-    document: Mapping[str, Any], path: Path, *, metrics: Sequence[str] = ("success_rate", "survival_weighted_tracking")
+    document: Mapping[str, Any],
+    path: Path | TextIO,
+    *,
+    metrics: Sequence[str] = ("success_rate", "survival_weighted_tracking"),
 ) -> None:
-    """Bars of every policy clip by clip, with 95 % intervals, targets first and shaded; a PNG."""
+    """Bars of every policy clip by clip, with 95 % intervals, targets first and shaded."""
     policies, clips = policy_order(document), clip_order(document)
     targets = sum(document["policies"][policies[0]]["clips"][clip]["target"] for clip in clips)
     figure = new_figure(width=2.0 + 0.7 * len(clips), height=3.0 * len(metrics))
@@ -35,12 +42,12 @@ def clip_bars(
     save(figure, path)
 
 
-def training_curves(metrics_file: Path, path: Path, *, keys: Sequence[str] | None = None) -> None:
-    """One panel a key of a metrics.jsonl over environment steps; a PNG.
+def training_curves(metrics_file: Path, path: Path | TextIO, *, keys: Sequence[str] | None = None) -> None:
+    """One panel a key of a metrics.jsonl over environment steps.
 
     Args:
         metrics_file: one JSON object a line with iteration, environment_steps and numbers.
-        path: PNG to write.
+        path: where it goes.
         keys: which numbers to draw; all that are there by default.
 
     Raises:
@@ -84,6 +91,45 @@ def clips_over_time(evaluations_file: Path, path: Path) -> None:
     save(figure, path)
 
 
+def unlearning_curves(rows: Sequence[Mapping[str, Any]], path: Path | TextIO, *, penalty: float | None) -> None:
+    """Tracking on target and kept steps, λ_crit, and the share of the steps, over an unlearning run.
+
+    Args:
+        rows: of its metrics.jsonl.
+        path: where it goes.
+        penalty: λ, drawn beside λ_crit; None for a method without.
+    """
+    figure = new_figure(width=11.0, height=2.8)
+    steps = [row["environment_steps"] / 1e6 for row in rows]
+    panels = {"tracking_reward": "tracking reward while training", "lambda_crit": "λ_crit", "step_share": "step share"}
+    for panel, (key, title) in enumerate(panels.items()):
+        axes = figure.add_subplot(1, len(panels), panel + 1)
+        for group in ("target", "kept"):
+            axes.plot(steps, [row[f"{group}/{key}"] for row in rows], label=group, color=GROUP_COLOURS[group])
+        if key == "lambda_crit" and penalty is not None:
+            axes.axhline(penalty, color="0.4", linestyle="--", label="λ")
+        axes.set_title(title, fontsize="medium")
+        axes.set_xlabel("million environment steps", fontsize="small")
+        axes.legend(fontsize="small", frameon=False)
+    save(figure, path)
+
+
+def sampling_shares(rows: Sequence[Mapping[str, Any]], path: Path | TextIO, *, targets: Sequence[str]) -> None:
+    """How often each clip was drawn and how many of the steps were lived in it, means over the rows; targets first."""
+    clips = sorted(rows[0]["clips"], key=lambda clip: (clip not in targets, clip))
+    figure = new_figure(width=2.0 + 0.7 * len(clips), height=2.6)
+    axes = figure.add_subplot()
+    axes.axvspan(-0.5, sum(clip in targets for clip in clips) - 0.5, color="0.92")
+    for offset, (key, label) in enumerate({"probability": "of the starts", "step_share": "of the steps"}.items()):
+        shares = [100.0 * sum(row["clips"][clip][key] for row in rows) / len(rows) for clip in clips]
+        axes.bar([clip + (offset - 0.5) * 0.4 for clip in range(len(clips))], shares, 0.4, label=label)
+    axes.set_ylabel("%")
+    axes.set_xlim(-0.5, len(clips) - 0.5)
+    axes.set_xticks(range(len(clips)), clips, rotation=30, ha="right")
+    axes.legend(ncols=2, loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
+    save(figure, path)
+
+
 def bars(axes: Axes, places: Sequence[str], series: Mapping[str, Sequence[Estimate]]) -> None:
     """Groups of bars with their intervals, one group a place, one bar in it a series."""
     width = 0.8 / len(series)
@@ -124,10 +170,15 @@ def new_figure(*, width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def save(figure: Figure, path: Path) -> None:
+def save(figure: Figure, path: Path | TextIO) -> None:
     """Write a figure as its path's ending says; an SVG of the same figure is the same file."""
     import matplotlib
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with matplotlib.rc_context({"svg.hashsalt": path.stem}):
-        figure.savefig(path, dpi=150, metadata={"Date": None} if path.suffix == ".svg" else None)
+    if isinstance(path, Path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with matplotlib.rc_context({"svg.hashsalt": path.stem}):
+            figure.savefig(path, dpi=150, metadata={"Date": None} if path.suffix == ".svg" else None)
+        return
+    # In a page: text stays text, in the page's own font.
+    with matplotlib.rc_context({"svg.hashsalt": "page", "svg.fonttype": "none", "font.family": "sans-serif"}):
+        figure.savefig(path, format="svg", metadata={"Date": None, "Creator": None})

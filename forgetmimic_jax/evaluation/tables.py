@@ -51,7 +51,9 @@ BLOCK = re.compile(r"(<!-- evaluation:start (?P<path>\S+) -->\n).*?(<!-- evaluat
 
 
 @dataclass(frozen=True)
-class _Rows:
+class Rows:
+    """A table as text: what the terminal, Markdown and the report show."""
+
     title: str
     header: list[str]
     rows: list[list[str]]
@@ -60,7 +62,7 @@ class _Rows:
 def render_table(document: Mapping[str, Any]) -> RenderableType:
     """What was forgotten and what was kept, at one glance, for `rich.console.Console.print`."""
     clips, groups = _clip_rows(document, digits=2, interval=False), _group_rows(document, digits=2)
-    return Group(_rich(clips), _rich(groups), Text("\n".join(_notes(document)), style="dim"))
+    return Group(_rich(clips), _rich(groups), Text("\n".join(notes(document)), style="dim"))
 
 
 def markdown(document: Mapping[str, Any]) -> str:
@@ -71,10 +73,15 @@ def markdown(document: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def result_tables(document: Mapping[str, Any]) -> list[Rows]:
+    """The two tables of a result: clip by clip, and by group."""
+    return [_clip_rows(document), _group_rows(document)]
+
+
 def markdown_tables(document: Mapping[str, Any]) -> str:
     """The two tables of a result, clip by clip and by group, with their notes."""
-    tables = [_markdown(_clip_rows(document)), _markdown(_group_rows(document))]
-    return "\n".join([*tables, *(f"- {note}" for note in _notes(document)), ""])
+    tables = [_markdown(table) for table in result_tables(document)]
+    return "\n".join([*tables, *(f"- {note}" for note in notes(document)), ""])
 
 
 def fill(text: str, directory: Path) -> str:
@@ -113,7 +120,7 @@ def _subject(document: Mapping[str, Any]) -> str | None:
     return next((policy for policy in policy_order(document) if policy not in (BASE, ZERO_ACTION)), None)
 
 
-def _clip_rows(document: Mapping[str, Any], *, digits: int = 3, interval: bool = True) -> _Rows:
+def _clip_rows(document: Mapping[str, Any], *, digits: int = 3, interval: bool = True) -> Rows:
     """One row a clip, targets first: success and tracking of base and subject, the floor, what is left."""
     policies, subject = document["policies"], _subject(document)
     shown = [policy for policy in (BASE, subject) if policy and policy in policies]
@@ -134,7 +141,7 @@ def _clip_rows(document: Mapping[str, Any], *, digits: int = 3, interval: bool =
             left = of[shown[1]].get("skill" if ZERO_ACTION in policies else "retention")
             row += [percent(left, interval=interval), _verdict(left, role)]
         rows.append(row)
-    return _Rows("Clip by clip", header, rows)
+    return Rows("Clip by clip", header, rows)
 
 
 def _verdict(left: Estimate | None, role: str) -> str:
@@ -145,7 +152,7 @@ def _verdict(left: Estimate | None, role: str) -> str:
     return (WANTED if (left["mean"] <= FORGOTTEN) == (role == "target") else UNWANTED)[role]
 
 
-def _group_rows(document: Mapping[str, Any], *, digits: int = 3) -> _Rows:
+def _group_rows(document: Mapping[str, Any], *, digits: int = 3) -> Rows:
     """Targets and kept clips of every policy, with intervals."""
     policies, order = document["policies"], policy_order(document)
     rows = []
@@ -169,10 +176,10 @@ def _group_rows(document: Mapping[str, Any], *, digits: int = 3) -> _Rows:
         cells = [number(policies[policy].get(metric), digits) for policy in order]
         if any(cells):
             rows.append([label, *cells])
-    return _Rows("Targets and kept clips", ["", *(_words(policy) for policy in order)], rows)
+    return Rows("Targets and kept clips", ["", *(_words(policy) for policy in order)], rows)
 
 
-def _error_rows(document: Mapping[str, Any]) -> _Rows:
+def _error_rows(document: Mapping[str, Any]) -> Rows:
     """Tracking errors and physical measures of every policy by group, over steps alive and over common steps."""
     policies, order = document["policies"], policy_order(document)
     rows = []
@@ -182,7 +189,7 @@ def _error_rows(document: Mapping[str, Any]) -> _Rows:
             name, common = metric.removesuffix("_common"), metric.endswith("_common")
             label = f"{_words(name)}, {UNITS.get(name, 'm')}{', common steps' if common else ''}"
             rows.append([f"{group}: {label}", *(number(policies[policy][group].get(metric)) for policy in order)])
-    return _Rows("Errors", ["", *(_words(policy) for policy in order)], rows)
+    return Rows("Errors", ["", *(_words(policy) for policy in order)], rows)
 
 
 def _conditions(document: Mapping[str, Any]) -> list[str]:
@@ -205,31 +212,32 @@ def _budget(document: Mapping[str, Any]) -> str:
     return f"Seed {document['seed']}, {document['episodes']} episodes a clip.{trained}"
 
 
-def _notes(document: Mapping[str, Any]) -> list[str]:
+def notes(document: Mapping[str, Any]) -> list[str]:
+    """What a reader of the tables must know."""
     n = document["episodes"]
     nothing = statistics.rate(0, n)
     trained = bool(_subject(document)) and BASE in document["policies"]
     measure = "skill above the zero-action floor" if ZERO_ACTION in document["policies"] else "tracking"
-    notes = [
+    told = [
         "tracking: mean tracking reward over the horizon, 0 after a fall (survival-weighted); "
         "while alive: the paper's, over the steps before it.",
         f"0 successes of {n} still allow a rate of up to {100 * nothing['high']:.0f} % (95 % interval).",
     ]
     if document["targets"]:
-        notes.append("degradation ratio: target over kept, of tracking while alive (the paper's) and of tracking.")
+        told.append("degradation ratio: target over kept, of tracking while alive (the paper's) and of tracking.")
     if trained:
-        notes.append(
+        told.append(
             f"left: share of the base's {measure}; forgotten: at most {100 * FORGOTTEN:.0f} %, "
             f"kept: at least {100 * KEPT:.0f} %, not learned: the base itself is no better than the floor."
         )
     resets = {policy: summary["nan_resets"] for policy, summary in document["policies"].items()}
     if any(resets.values()):
-        notes.append(
+        told.append(
             "episodes ended by a NaN: "
             + ", ".join(f"{_words(p)} {count}" for p, count in resets.items() if count)
             + "."
         )
-    return notes
+    return told
 
 
 def _words(name: str) -> str:
@@ -255,7 +263,7 @@ def _cell(value: Estimate | None, interval: bool, digits: int, *, scale: float, 
     return text
 
 
-def _markdown(table: _Rows) -> str:
+def _markdown(table: Rows) -> str:
     return f"**{table.title}**\n\n{markdown_table(table.header, table.rows)}"
 
 
@@ -268,7 +276,7 @@ def _line(cells: Sequence[str]) -> str:
     return f"| {' | '.join(cell.replace('|', '&#124;') for cell in cells)} |"
 
 
-def _rich(table: _Rows) -> Table:
+def _rich(table: Rows) -> Table:
     colours = {text: "green" for text in WANTED.values()} | {text: "red" for text in UNWANTED.values()}
     view = Table(title=table.title, title_justify="left", box=box.SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
     for column, name in enumerate(table.header):

@@ -6,7 +6,7 @@ import pytest
 
 from forgetmimic_jax.options import parse
 
-COMMANDS = ["train", "unlearn", "evaluate", "bench", "export", "importers", "play", "video"]
+COMMANDS = ["train", "unlearn", "evaluate", "bench", "export", "importers", "play", "report", "video"]
 
 
 @pytest.mark.parametrize("command", COMMANDS)

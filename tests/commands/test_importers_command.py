@@ -36,7 +36,7 @@ def test_the_checkpoint_acts_as_rsl_rl_did(imported_run):
 
 
 def test_unlearning_starts_from_it(imported_run):
-    config = unlearn._config_of_new_run(unlearn.Options(base=imported_run.folder, targets="turn"))
+    config = unlearn.config_of_new_run(unlearn.Options(base=imported_run.folder, targets="turn"))
     small = [setting for setting in TINY if "layers" not in setting and "bin_seconds" not in setting]
     setup = runner.make_setup(override(config, small))
     start = runner.start_state(setup)

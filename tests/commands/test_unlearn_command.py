@@ -146,12 +146,12 @@ def test_a_stop_during_the_evaluation_says_how_to_go_on(unlearned_run, evaluated
 
 
 def test_targets_are_the_library_s_own_unless_named(options):
-    assert unlearn._config_of_new_run(options(targets=None)).unlearn.targets == ("turn",)
-    assert unlearn._config_of_new_run(options(targets="nod,sway")).unlearn.targets == ("nod", "sway")
+    assert unlearn.config_of_new_run(options(targets=None)).unlearn.targets == ("turn",)
+    assert unlearn.config_of_new_run(options(targets="nod,sway")).unlearn.targets == ("nod", "sway")
 
 
 def test_a_preset_brings_its_settings_but_keeps_the_base_s_network(options, base_run):
-    config = unlearn._config_of_new_run(options(preset="paper", seed=3))
+    config = unlearn.config_of_new_run(options(preset="paper", seed=3))
     base = load_config(base_run.folder / "config.yaml")
     assert (config.preset, config.iterations, config.seed, config.library) == ("paper", 1000, 3, base.library)
     assert (config.ppo.num_envs, config.ppo.actor_layers, config.ppo.critic_layers) == (4096, (16,), (16,))
@@ -262,7 +262,7 @@ def test_flags_that_contradict_the_run_to_resume_are_told(refused, unlearned_run
 
 def test_flags_choose_the_sampler_and_the_wrench(options):
     def settings(**given) -> tuple[str, str, float]:
-        config = unlearn._config_of_new_run(options(**given))
+        config = unlearn.config_of_new_run(options(**given))
         return config.sampling.rule, config.sampling.clips, config.wrench.max_gain
 
     assert settings() == ("uniform_clips", "all", 0.0)
@@ -277,18 +277,18 @@ def test_flags_choose_the_sampler_and_the_wrench(options):
 def test_a_wrench_that_the_base_did_not_have_is_the_paper_s(options, damaged):
     config = damaged / "config.yaml"
     config.write_text(config.read_text().replace("max_gain: 0.5", "max_gain: 0.0"))
-    assert unlearn._config_of_new_run(options(base=damaged)).wrench.max_gain == 0.0
-    assert unlearn._config_of_new_run(options(base=damaged, wrench=True)).wrench.max_gain == 0.6
+    assert unlearn.config_of_new_run(options(base=damaged)).wrench.max_gain == 0.0
+    assert unlearn.config_of_new_run(options(base=damaged, wrench=True)).wrench.max_gain == 0.6
 
 
 def test_retraining_takes_as_many_steps_as_the_base_did(options):
-    assert unlearn._config_of_new_run(options(method="retrain")).iterations == 4
-    assert unlearn._config_of_new_run(options(method="retrain", iterations=None, preset="paper")).iterations == 1
+    assert unlearn.config_of_new_run(options(method="retrain")).iterations == 4
+    assert unlearn.config_of_new_run(options(method="retrain", iterations=None, preset="paper")).iterations == 1
 
 
 @pytest.mark.parametrize("given", [{"sampler": "adaptive"}, {"sampler": "frozen"}, {"wrench": True}])
 def test_what_goes_by_failure_levels_goes_on_with_the_base_s(options, base_run, given):
-    setup = runner.make_setup(unlearn._config_of_new_run(options(**given)))
+    setup = runner.make_setup(unlearn.config_of_new_run(options(**given)))
     base = load_state(base_run.checkpoint(4)).failure_level
     np.testing.assert_array_equal(runner.start_state(setup).failure_level, base)
     assert (np.asarray(base) != 1.0).any()

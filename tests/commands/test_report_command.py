@@ -1,0 +1,273 @@
+import dataclasses
+import json
+import re
+import shutil
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from miniature import finished
+
+from forgetmimic_jax import report, unlearn
+from forgetmimic_jax.checkpoint import policy_hash, read_info
+from forgetmimic_jax.config import load_config
+from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.evaluation.verdict import RULES
+from forgetmimic_jax.options import override, parse
+from forgetmimic_jax.viewing import offscreen
+
+
+@pytest.fixture(scope="module")
+def run(unlearned_run, tmp_path_factory) -> Path:
+    """The miniature run with a film of one clip, as `make video` leaves it."""
+    folder = Path(shutil.copytree(unlearned_run.folder, tmp_path_factory.mktemp("reported") / "run"))
+    (folder / "videos").mkdir()
+    (folder / "videos" / "turn.mp4").write_bytes(b"a film")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def page(run) -> str:
+    finished(report.main, report.Options(run=run, films=1, output=run / "report.html"))
+    return (run / "report.html").read_text()
+
+
+@pytest.fixture(scope="module")
+def facts(run, page) -> dict:
+    return json.loads((run / "report.json").read_text())
+
+
+class Tags(HTMLParser):
+    """Every tag with its attributes; unbalanced ones are found."""
+
+    def __init__(self, page: str):
+        super().__init__()
+        self.open, self.attributes = [], []
+        self.feed(page)
+        assert not self.open
+
+    def handle_starttag(self, tag, attributes):
+        self.attributes += [(tag, *attribute) for attribute in attributes]
+        if tag not in ("meta", "br", "img", "link", "input"):
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        self.attributes += [(tag, *attribute) for attribute in attributes]
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def test_the_page_is_whole_and_needs_nothing_else(page):
+    tags = Tags(page)
+    links = [value for _, name, value in tags.attributes if name in ("src", "href", "xlink:href")]
+    assert links
+    assert all(link.startswith(("data:", "#")) for link in links)
+    assert not re.search(r"url\((?!#)|@import|<script", page)
+    assert 'name="viewport"' in page
+    assert "@media print" in page
+
+
+def test_the_page_tells_what_was_asked_done_and_found(page, run, base_run):
+    text = re.sub(r"\s+", " ", page)
+    for said in (
+        "is to forget turn and to keep the other 2 clips (nod, sway).",
+        "arft: Anti-reward fine-tuning",
+        "<th>Penalty λ</th><td>16</td>",
+        "2 iterations, 64 environment steps, 8 environments",
+        "4 iterations, 128 environment steps",
+        "0 (unlearning), 0 (evaluation)",
+        "3 episodes a clip with deterministic actions",
+        "Clip by clip"[:4],
+        policy_hash(read_info(run / "checkpoints" / "00000002")),
+        policy_hash(read_info(base_run.checkpoint(4))),
+        read_info(base_run.checkpoint(4)).library_hash,
+        "Everything is simulation.",
+        "Not tested: how fast fine-tuning would bring the targets back.",
+        "λ_crit = W (1 + R_reg / R_track)",
+    ):
+        assert said in text, said
+    assert page.count("<svg") == 3
+    assert 'src="data:video/mp4;base64,YSBmaWxt"' in page
+    assert "certif" not in page.lower()
+
+
+def test_the_tables_are_those_of_the_evaluation(page, run):
+    document = json.loads((run / "evaluation.json").read_text())
+    mean = document["policies"]["unlearned"]["clips"]["turn"]["survival_weighted_tracking"]["mean"]
+    assert re.search(rf'<tr class="target">\s*<td>turn</td><td>target</td>.*→ {mean:.3f} \[', page)
+
+
+def test_the_facts_lie_beside_it(facts, run):
+    assert facts["verdict"]["word"] in RULES
+    assert facts["verdict"]["rules"] == RULES
+    assert facts["evaluation"] == json.loads((run / "evaluation.json").read_text())
+    assert facts["done"]["Penalty λ"] == "16"
+
+
+def test_the_command_that_reproduces_it_gives_the_runs_settings(facts, run):
+    command, page = facts["commands"]
+    words = command.split()
+    assert words[:3] == [".venv/bin/python", "-m", "forgetmimic_jax.unlearn"]
+    options = parse(unlearn.Options, "unlearn", words[3:])
+    config = override(unlearn.config_of_new_run(options), [setting for group in options.set for setting in group])
+    assert dataclasses.replace(config, iterations=options.iterations) == load_config(run / "config.yaml")
+    assert page == f".venv/bin/python -m forgetmimic_jax.report --run {run}"
+
+
+def test_names_are_text_not_markup(run, tmp_path):
+    copy = Path(shutil.copytree(run, tmp_path / "run"))
+    text = (copy / "evaluation.json").read_text().replace('"turn"', '"<i>turn</i>"')
+    (copy / "evaluation.json").write_text(text)
+    finished(report.main, report.Options(run=copy, films=0, output=copy / "report.html"))
+    page = (copy / "report.html").read_text()
+    assert "&lt;i&gt;turn&lt;/i&gt;" in page
+    assert "<i>" not in page
+    Tags(page)
+
+
+def test_comparisons_enter_the_verdict(run, tmp_path):
+    """Made by hand: the base has skill, the unlearned policy none of it, and it relearns fast."""
+    copy = Path(shutil.copytree(run, tmp_path / "run"))
+    document = json.loads((copy / "evaluation.json").read_text())
+    for group, mean in (("target", 0.0), ("kept", 1.0)):
+        skill = {"mean": mean, "low": mean - 0.1, "high": mean + 0.1, "std": 0.1, "n": 3}
+        document["policies"]["unlearned"][group]["skill"] = skill
+    (copy / "evaluation.json").write_text(json.dumps(document))
+    control = tmp_path / "retrained"
+    control.mkdir()
+    policies = {"retrained": document["policies"]["unlearned"]}
+    (control / "evaluation.json").write_text(json.dumps(document | {"policies": policies}))
+    counts = tmp_path / "relearning.json"
+    asked = {"library": document["library_hash"], "targets": document["targets"]}
+
+    def curve(steps: int) -> dict:
+        return {"tracking": [0.1, 0.39, 0.4, 0.2], "target_steps": [0, steps / 2, steps, 2 * steps]}
+
+    def word(unlearned: int) -> str:
+        # The base tracks at 0.5, so 0.4 is relearned; the retrained policy is there after 1000 steps on the targets.
+        starts = {"unlearned": {"0": curve(unlearned), "1": curve(unlearned)}, "retrained": {"0": curve(1000)}}
+        counts.write_text(json.dumps({"asked": asked, "results": {"base": 0.5, "starts": starts}}))
+        options = report.Options(run=copy, retrained=control, relearning=counts, films=0, output=tmp_path / "r.html")
+        printed = finished(report.main, options).printed
+        facts = json.loads((tmp_path / "r.json").read_text())
+        assert printed.startswith(f"{facts['verdict']['word']}: ")
+        assert not any("retrained without" in limit or "bring the" in limit for limit in facts["limits"])
+        assert facts["commands"][1].endswith(f"--retrained {control} --relearning {counts}")
+        return facts["verdict"]["word"]
+
+    assert word(900) == "consistent with retraining"
+    assert word(100) == "suppressed but recoverable"
+
+
+def test_where_nothing_can_be_drawn_the_page_says_so(run, tmp_path, monkeypatch):
+    def cannot():
+        raise InputError("rendering: cannot draw here")
+
+    monkeypatch.setattr(offscreen, "check_rendering", cannot)
+    output = tmp_path / "report.html"
+    printed = finished(report.main, report.Options(run=run, films=2, output=output)).printed
+    assert re.search(r"No films of (nod|sway): rendering: cannot draw here\.", output.read_text())
+    assert "No films of " in printed
+    assert "data:video/mp4" in output.read_text()  # the film that was there
+
+
+def test_clips_without_a_film_are_filmed(run, tmp_path, monkeypatch):
+    try:
+        offscreen.check_rendering()
+    except InputError as error:
+        pytest.skip(str(error))
+    from forgetmimic_jax.viewing import film
+
+    monkeypatch.setattr(film, "PANE", (96, 96))
+    monkeypatch.setattr(report, "FILM_SECONDS", 0.1)
+    output = tmp_path / "report.html"
+    finished(report.main, report.Options(run=run, films=2, output=output))
+    assert output.read_text().count("data:video/mp4;base64,") == 2
+
+
+def test_without_a_training_log_there_are_no_curves(run, tmp_path):
+    copy = Path(shutil.copytree(run, tmp_path / "run"))
+    (copy / "metrics.jsonl").unlink()
+    finished(report.main, report.Options(run=copy, films=0, output=copy / "report.html"))
+    page = (copy / "report.html").read_text()
+    assert page.count("<svg") == 1
+    assert "While it was unlearning" not in page
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"run": Path("nowhere")}, "nowhere: no such run folder"),
+        ({"films": -1}, "--films: found -1; accepted: 0 or more"),
+        ({"output": Path("report.pdf")}, "report.pdf: --output is an .html file"),
+        ({"output": Path(__file__) / "r.html"}, f"{__file__}: {__file__} is a file; choose another --output"),
+        ({"retrained": Path("nowhere")}, "nowhere/evaluation.json: not found"),
+        ({"relearning": Path("nowhere.json")}, "nowhere.json: not found"),
+    ],
+)
+def test_what_cannot_be_is_told_in_one_line(refused, run, given, told):
+    assert refused(report.main, report.Options(**{"run": run, "output": Path("r.html"), "films": 0} | given)) == told
+
+
+def test_what_is_no_unlearning_run_is_told(refused, base_run, run, tmp_path):
+    told = refused(report.main, report.Options(run=base_run.folder))
+    assert told.startswith(
+        f"{base_run.folder}/evaluation.json: not found; make it first, with: make evaluate CHECKPOINT"
+    )
+    copy = Path(shutil.copytree(run, tmp_path / "run"))
+    whole = json.loads((copy / "evaluation.json").read_text())
+
+    def told_of(content: str) -> str:
+        (copy / "evaluation.json").write_text(content)
+        return refused(report.main, report.Options(run=copy)).removeprefix(f"{copy}/")
+
+    assert told_of("{").startswith("evaluation.json: damaged: JSONDecodeError: ")
+    assert told_of("{}") == "evaluation.json: damaged: KeyError: 'policies'"
+    base_only = whole | {"policies": {"base": whole["policies"]["base"]}, "targets": []}
+    assert told_of(json.dumps(base_only)).startswith("evaluation.json: found base and 0 targets; a report needs base, ")
+    gone = whole | {"checkpoint": "runs/x/checkpoints/00000009"}
+    assert told_of(json.dumps(gone)).startswith(
+        "checkpoints/00000009: evaluation.json is of this checkpoint, which is g"
+    )
+
+
+def test_comparisons_that_do_not_fit_are_told(refused, run, tmp_path):
+    other = tmp_path / "other"
+    other.mkdir()
+    document = json.loads((run / "evaluation.json").read_text())
+
+    def told_of(content: dict) -> str:
+        (other / "evaluation.json").write_text(json.dumps(content))
+        options = report.Options(run=run, retrained=other, films=0, output=tmp_path / "r.html")
+        return refused(report.main, options).removeprefix(f"{other}/evaluation.json: ")
+
+    assert told_of(document) == "no evaluation of a retrained policy: KeyError: 'retrained'"
+    fits = document | {"policies": {"retrained": document["policies"]["unlearned"]}}
+    assert told_of(fits | {"episodes": 50}) == "episodes: found 50; the unlearned run's is 3"
+    assert told_of(fits | {"library_hash": "x"}).startswith("library_hash: found x; the unlearned run's is ")
+
+    counts = tmp_path / "relearning.json"
+
+    def told_of_counts(content: str) -> str:
+        counts.write_text(content)
+        return refused(report.main, report.Options(run=run, relearning=counts, films=0)).removeprefix(f"{counts}: ")
+
+    assert told_of_counts("[]").startswith("no relearning study: TypeError: ")
+    asked = {"library": document["library_hash"], "targets": document["targets"]}
+    starts = {"unlearned": {}, "retrained": {}}
+    results = {"base": 0.5, "starts": starts}
+    only = {"asked": asked, "results": {"base": 0.5, "starts": {"unlearned": {}}}}
+    assert told_of_counts(json.dumps(only)) == "no relearning study: KeyError: 'retrained'"
+    other_targets = {"asked": asked | {"targets": ["nod"]}, "results": results}
+    assert told_of_counts(json.dumps(other_targets)) == "targets: found ['nod']; the unlearned run's is ['turn']"
+
+
+def test_a_seed_that_never_relearned_makes_it_never(run, tmp_path):
+    curves = {"0": {"tracking": [0.5], "target_steps": [10.0]}, "1": {"tracking": [0.3], "target_steps": [10.0]}}
+    document = json.loads((run / "evaluation.json").read_text())
+    asked = {"library": document["library_hash"], "targets": document["targets"]}
+    results = {"base": 0.5, "starts": {"unlearned": curves, "retrained": {"0": curves["0"]}}}
+    path = tmp_path / "relearning.json"
+    path.write_text(json.dumps({"asked": asked, "results": results}))
+    assert report._relearning(path, document) == {"unlearned": None, "retrained": 10.0}
