@@ -38,6 +38,7 @@ The shipped base (`data/g1/base`, {environment_steps:,} environment steps): {gro
   rest is between the rollouts of one state.
 - *Cosine*: between the gradients (of the first action's mean) with this λ and with λ = 1.
 - *Saved by branches*: by which factor the variance falls when a rollout is measured against the others of its state.
+- Empty: the square of that gradient is not above its noise in this many states.
 - *By branches and λ*: by which factor fewer samples give the same accuracy along the gradient of λ = 1, against plain
   PPO with λ = 0.9.
 
@@ -106,19 +107,25 @@ def measure() -> dict:
     }  # fmt: skip
 
 
+def number(value: float, digits: int) -> str:
+    """A cell; empty where the gradient does not stand out from its noise."""
+    return "" if np.isnan(value) else f"{value:.{digits}f}"
+
+
 def page(found: dict) -> str:
     """The page of the stored numbers."""
     within, between = np.array(found["within"]), np.array(found["between"])
     products = np.array(found["products"])
-    length = np.sqrt(np.diag(products))
+    square = np.diag(products)
+    length = np.sqrt(np.where(square > 0, square, np.nan))
     cosine = products[:, -1] / (length * length[-1])
     projection = products[:, -1] / length[-1]
     plain = found["lambda"].index(0.9)
     total = within + between
     saved = (projection**2 / within) / (projection[plain] ** 2 / total[plain])
     rows = [
-        f"| {value:g} | {total[i]:.4f} | {between[i] / total[i]:.0%} | {cosine[i]:.2f} | {total[i] / within[i]:.1f} | "
-        f"{saved[i]:.1f} |"
+        f"| {value:g} | {total[i]:.4f} | {between[i] / total[i]:.0%} | {number(cosine[i], 2)} | "
+        f"{total[i] / within[i]:.1f} | {number(saved[i], 1)} |"
         for i, value in enumerate(found["lambda"])
     ]
     rollout = found["rollout"]

@@ -67,7 +67,7 @@ class Options:
 
 
 ITERATIONS = {"cpu": 400, "paper": 1000}
-PACE = ("schedule", "target_kl", "min_learning_rate", "max_learning_rate")
+PACE: dict[str, Any] = {"schedule": "fixed", "learning_rate": 1.5e-4}
 
 
 def main(options: Options) -> None:
@@ -118,9 +118,6 @@ def config_of_new_run(options: Options) -> Config:
 
     info = checkpoint.read_info(options.base or runner.base_folder(options.robot))
     base = config = info.config
-    # A base's last training may have been slowed down to settle it; forgetting is to go at the preset's pace.
-    pace: dict[str, Any] = {name: getattr(preset(base.preset).ppo, name) for name in PACE}
-    config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, **pace))
     if options.preset:
         config = preset(options.preset)
         # The network is the base's, and so are the bins of its failure levels: they are what unlearning starts from.
@@ -129,7 +126,10 @@ def config_of_new_run(options: Options) -> Config:
         ppo = dataclasses.replace(config.ppo, **layers)
         config = dataclasses.replace(config, library=base.library, sampling=sampling, ppo=ppo)
     iterations = ITERATIONS[options.preset or "cpu"]
-    if find_method(options.method).start == "fresh":
+    if find_method(options.method).start == "base" and config.preset == "cpu":
+        # A base's last training may have been slowed down to settle it, and forgetting has to be done in its budget.
+        config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, **PACE))
+    elif find_method(options.method).start == "fresh":
         iterations = max(1, round(info.environment_steps / (config.ppo.num_envs * config.ppo.num_steps)))
     config = dataclasses.replace(config, base=None, evaluate_every=0, iterations=iterations)
     config = replace_given(config, robot=options.robot, seed=options.seed, library=options.library, base=options.base)
