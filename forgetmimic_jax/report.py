@@ -29,6 +29,8 @@ class Options:
 
     run: Path
     """Folder of the run, with its evaluation.json."""
+    base: Path | None = None
+    """Checkpoint that the run started from; the one its settings name by default."""
     retrained: Path | None = None
     """Run of `make unlearn ARGS='--method retrain'` with the same targets and evaluation, to compare with."""
     relearning: Path | None = None
@@ -67,12 +69,12 @@ def main(options: Options) -> None:
     path = _checkpoint(options.run, document)
     runner.check_writable(output.parent)
     info = checkpoint.read_info(path)
-    base = checkpoint.read_info(runner.base_checkpoint(info.config))
+    base = _base(options, document, info)
     retrained = None if options.retrained is None else _retrained(options.retrained, document)
     relearning = None if options.relearning is None else _relearning(options.relearning, document)
     verdict = judge(document["policies"], retrained=retrained, relearning=relearning)
     rows = [row for row in read_rows(options.run / "metrics.jsonl") if "target/lambda_crit" in row]
-    films, films_missing = _films(options, document, info)
+    films, films_missing = _films(options, document, info, base)
 
     facts = {
         "verdict": {"word": verdict.word, "reasons": list(verdict.reasons), "rules": RULES},
@@ -153,6 +155,20 @@ def _checkpoint(run: Path, document: Mapping[str, Any]) -> Path:
     if not path.is_dir():
         raise InputError(f"{path}: evaluation.json is of this checkpoint, which is gone; evaluate one that is there")
     return path
+
+
+def _base(options: Options, document: Mapping[str, Any], info: CheckpointInfo) -> CheckpointInfo:
+    """The base that was evaluated; a shipped one may have been replaced since."""
+    from forgetmimic_jax import checkpoint, runner
+
+    base = checkpoint.read_info(options.base or runner.base_checkpoint(info.config))
+    evaluated = document.get("budget", {}).get("base", {}).get("environment_steps", base.environment_steps)
+    if evaluated != base.environment_steps:
+        raise InputError(
+            f"{base.path}: trained for {base.environment_steps:,} environment steps; the base that was evaluated for "
+            f"{evaluated:,}; name it with --base"
+        )
+    return base
 
 
 def _retrained(run: Path, document: Mapping[str, Any]) -> dict[str, Any]:
@@ -310,7 +326,7 @@ def _commands(options: Options, document: Mapping[str, Any], info: CheckpointInf
         "penalty": config.unlearn.penalty,
         "iterations": config.iterations,
         "seed": config.seed,
-        "base": None if config.base is None else Path(config.base),
+        "base": options.base or (None if config.base is None else Path(config.base)),
         "episodes": document["episodes"],
         "library": None if config.library is None else Path(config.library),
     }
@@ -319,14 +335,14 @@ def _commands(options: Options, document: Mapping[str, Any], info: CheckpointInf
     changed = [
         f"{name}={json.dumps(value, separators=(',', ':')) if isinstance(value, list) else value}"
         for name, value in _settings(to_dict(config))
-        if plain[name] != value and name != "iterations"
+        if plain[name] != value and name not in ("iterations", "base")
     ]
     words = [f"--{flag} {value:g}" if flag == "penalty" else f"--{flag} {value}"
              for flag, value in flags.items() if value is not None]  # fmt: skip
     if changed:
         words.append(f"--set {' '.join(changed)}")
     page = [f"--run {options.run}"]
-    page += [f"--{name} {value}" for name in ("retrained", "relearning") if (value := getattr(options, name))]
+    page += [f"--{name} {value}" for name in ("base", "retrained", "relearning") if (value := getattr(options, name))]
     return [
         f".venv/bin/python -m forgetmimic_jax.unlearn {' '.join(words)} --output {options.run}",
         f".venv/bin/python -m forgetmimic_jax.report {' '.join(page)}",
@@ -358,7 +374,9 @@ def _identity(document: Mapping[str, Any], info: CheckpointInfo, base: Checkpoin
     }
 
 
-def _films(options: Options, document: Mapping[str, Any], info: CheckpointInfo) -> tuple[list[dict[str, str]], str]:
+def _films(
+    options: Options, document: Mapping[str, Any], info: CheckpointInfo, base: CheckpointInfo
+) -> tuple[list[dict[str, str]], str]:
     """Films as base64 with captions, and why there are none or fewer."""
     from forgetmimic_jax.comparison import load_comparison
     from forgetmimic_jax.console import progress
@@ -381,7 +399,7 @@ def _films(options: Options, document: Mapping[str, Any], info: CheckpointInfo) 
         except InputError as error:
             missing = f"No films of {_list(needed)}: {error}."
         else:
-            compared = load_comparison(info.path, robot=info.robot, physics="native")
+            compared = load_comparison(info.path, robot=info.robot, base=base.path, physics="native")
             setup = compared.setup
             episodes = record(setup.config, setup.robot, setup.library, compared.policies, needed)
             with film.pane_renderer(info.robot) as renderer, progress("film", len(needed)) as report:

@@ -232,6 +232,17 @@ def test_what_is_no_unlearning_run_is_told(refused, base_run, run, tmp_path):
     )
 
 
+def test_a_base_that_was_replaced_since_is_told(refused, run, base_run, tmp_path):
+    def told_of(base: Path) -> str:
+        return refused(report.main, report.Options(run=run, base=base, films=0, output=tmp_path / "r.html"))
+
+    other = base_run.checkpoint(2)
+    assert told_of(other) == (
+        f"{other}: trained for 64 environment steps; the base that was evaluated for 128; name it with --base"
+    )
+    assert told_of(Path("nowhere")) == "nowhere: no such checkpoint folder"
+
+
 def test_comparisons_that_do_not_fit_are_told(refused, run, tmp_path):
     other = tmp_path / "other"
     other.mkdir()
