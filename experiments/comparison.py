@@ -60,8 +60,6 @@ def differences(variants: Mapping[str, Any], label: str) -> list[str]:
 STUDY = Study(
     name="comparison",
     title="Every method at the same budget",
-    iterations={"cpu": 400, "paper": 1000},
-    asks=(),
     measure=measure,
     tell=tell,
     draw=lambda document: variant_bars(document["results"]["variants"]),

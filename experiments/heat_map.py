@@ -97,7 +97,6 @@ STUDY = Study(
     name="heat_map",
     title="Does a long unlearning run wear the kept clips down?",
     iterations={"cpu": 840, "paper": 99_981},
-    asks=(),
     measure=measure,
     tell=tell,
     draw=draw,

@@ -97,8 +97,6 @@ def draw(document: Mapping[str, Any]) -> Figure:
 STUDY = Study(
     name="membership",
     title="Can one tell that a policy was trained on the targets?",
-    iterations={"cpu": 400, "paper": 1000},
-    asks=(),
     measure=measure,
     tell=tell,
     draw=draw,

@@ -78,8 +78,6 @@ def draw(document: Mapping[str, Any]) -> Figure:
 STUDY = Study(
     name="physical_behaviour",
     title="What does the robot do when it is asked for a forgotten clip?",
-    iterations={"cpu": 400, "paper": 1000},
-    asks=(),
     measure=measure,
     tell=tell,
     draw=draw,

@@ -129,7 +129,6 @@ STUDY = Study(
     name="relearning",
     title="How fast does a forgotten motion come back?",
     iterations={"cpu": 800, "paper": 10_000},
-    asks=(),
     measure=measure,
     tell=tell,
     draw=draw,

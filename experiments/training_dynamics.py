@@ -81,8 +81,6 @@ def draw(document: Mapping[str, Any]) -> Figure:
 STUDY = Study(
     name="training_dynamics",
     title="Two configurations on their way",
-    iterations={"cpu": 400, "paper": 1000},
-    asks=(),
     measure=measure,
     tell=tell,
     draw=draw,

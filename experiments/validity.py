@@ -8,7 +8,6 @@ from forgetmimic_jax.study import main, variants_study
 STUDY = variants_study(
     "validity",
     "Are the targets forgotten and the other clips kept?",
-    {"cpu": 400, "paper": 1000},
     lambda lab: {"λ = 8": {"penalty": 8.0}, "λ = 16": {"penalty": 16.0}},
     paper.VALIDITY,
 )

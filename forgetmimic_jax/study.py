@@ -26,6 +26,7 @@ from forgetmimic_jax.evaluation.plots import save
 from forgetmimic_jax.evaluation.variants import over_seeds, summary, variant_bars, variant_table
 from forgetmimic_jax.motion.clip import write_atomically
 from forgetmimic_jax.options import Settings, at_least, comma_separated, replace_given
+from forgetmimic_jax.unlearn import ITERATIONS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -80,20 +81,20 @@ class Study:
     Args:
         name: of its files.
         title: what is asked, in a few words.
-        iterations: of each trial, by budget.
-        asks: what beside the options the answer depends on, such as the values of a sweep.
         measure: runs the trials; the JSON's `results`.
         tell: (document) → the page's body in Markdown: tables, and what has to be said of them.
         draw: (document) → its figure.
+        iterations: of each trial, by budget; those of `forgetmimic_jax.unlearn` by default.
+        asks: what beside the options the answer depends on, such as the values of a sweep.
     """
 
     name: str
     title: str
-    iterations: Mapping[str, int]
-    asks: Sequence[str]
     measure: Callable[[Lab], dict[str, Any]]
     tell: Callable[[Mapping[str, Any]], str]
     draw: Callable[[Mapping[str, Any]], Figure]
+    iterations: Mapping[str, int] = field(default_factory=lambda: ITERATIONS)
+    asks: Sequence[str] = ()
 
 
 class Lab:
@@ -298,10 +299,10 @@ def page(study: Study, document: Mapping[str, Any]) -> str:
 def variants_study(
     name: str,
     title: str,
-    iterations: Mapping[str, int],
     variants: Callable[[Lab], Mapping[str, Mapping[str, Any]]],
     theirs: Mapping[str, Any],
     *,
+    iterations: Mapping[str, int] = ITERATIONS,
     asks: Sequence[str] = (),
     tell: Callable[[Mapping[str, Any]], str] | None = None,
     draw: Callable[[Mapping[str, Any]], Figure] | None = None,
@@ -311,9 +312,9 @@ def variants_study(
     Args:
         name: of its files.
         title: what is asked.
-        iterations: of each trial, by budget.
         variants: by label, the options of `forgetmimic_jax.unlearn` that a lab is to try.
         theirs: the paper's numbers.
+        iterations: see `Study`.
         asks: see `Study`.
         tell: another page than the table, from the document.
         draw: another figure than the bars.

@@ -19,6 +19,7 @@ from forgetmimic_jax.evaluation.variants import variant_table
 from forgetmimic_jax.options import comma_separated, parse
 from forgetmimic_jax.study import Lab, Study, conduct, variants_study
 from forgetmimic_jax.study import Options as StudyOptions
+from forgetmimic_jax.unlearn import ITERATIONS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
 PENALTIES = ("0.5", "1", "4", "6", "7", "8", "9", "12", "16")  # the paper's, and the neighbours of W = 8
 GROUPS = ("punch,kick", "dance_a,dance_b", "run")  # combat, dance and locomotion, as in the paper
 SAMPLERS = ("uniform_clips", "uniform_bins", "frozen", "adaptive")
-ITERATIONS = {"cpu": 400, "paper": 1000}
 
 
 @dataclass(kw_only=True)
@@ -52,9 +52,9 @@ def lambda_study(penalties: tuple[str, ...] = PENALTIES, name: str = "lambda") -
     return variants_study(
         name,
         "The penalty λ",
-        {"cpu": 400, "paper": 30_000},
         lambda lab: values,
         paper.LAMBDA,
+        iterations=ITERATIONS | {"paper": 30_000},
         asks=list(values),
         tell=lambda document: _tell_lambda(document["results"]["variants"]),
         draw=lambda document: _draw_lambda(document["results"]["variants"]),
@@ -75,7 +75,6 @@ def targets_study(groups: tuple[str, ...] = GROUPS, name: str = "targets") -> St
     return variants_study(
         name,
         "Other motions as targets",
-        ITERATIONS,
         variants,
         {},
         asks=list(groups),
@@ -89,14 +88,12 @@ def sampler_study(samplers: tuple[str, ...] = SAMPLERS) -> Study:
         if sampler not in SAMPLERS:
             raise InputError(f"--values: no sampler '{sampler}'; known: {', '.join(SAMPLERS)}")
     asks = list(samplers)
-    return variants_study(
-        "sampler", "Sampler and wrench", ITERATIONS, lambda lab: ablation(samplers), paper.ABLATION, asks=asks
-    )
+    return variants_study("sampler", "Sampler and wrench", lambda lab: ablation(samplers), paper.ABLATION, asks=asks)
 
 
 def seeds_study(_: tuple[str, ...] = ()) -> Study:
     """The default run with several seeds."""
-    return variants_study("seeds", "The default run", ITERATIONS, lambda lab: {"λ = 16": {}}, paper.VALIDITY)
+    return variants_study("seeds", "The default run", lambda lab: {"λ = 16": {}}, paper.VALIDITY)
 
 
 def ablation(samplers: tuple[str, ...] = SAMPLERS) -> dict[str, dict[str, Any]]:

@@ -125,11 +125,11 @@ def config_of_new_run(options: Options) -> Config:
         sampling = dataclasses.replace(config.sampling, bin_seconds=base.sampling.bin_seconds)
         ppo = dataclasses.replace(config.ppo, **layers)
         config = dataclasses.replace(config, library=base.library, sampling=sampling, ppo=ppo)
-    iterations = ITERATIONS[options.preset or "cpu"]
-    if find_method(options.method).start == "base" and config.preset == "cpu":
+    iterations, start = ITERATIONS[options.preset or "cpu"], find_method(options.method).start
+    if start == "base" and config.preset == "cpu":
         # A base's last training may have been slowed down to settle it, and forgetting has to be done in its budget.
         config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, **PACE))
-    elif find_method(options.method).start == "fresh":
+    elif start == "fresh":
         iterations = max(1, round(info.environment_steps / (config.ppo.num_envs * config.ppo.num_steps)))
     config = dataclasses.replace(config, base=None, evaluate_every=0, iterations=iterations)
     config = replace_given(config, robot=options.robot, seed=options.seed, library=options.library, base=options.base)

@@ -207,14 +207,16 @@ def improve(
         loss, metrics = method.loss(env.config, data, now, state.iteration)
         return loss, metrics | {"kl": kl_divergence(data.mean, old_log_std, mean, log_std).mean()}
 
+    def adapt(learning_rate: Array, kl: Array) -> Array:
+        bounds = config.min_learning_rate, config.max_learning_rate
+        return adapt_learning_rate(learning_rate, kl, config.target_kl, *bounds)
+
     def minibatch(carry, indices: Array):
         params, optimizer_state, learning_rate = carry
         data = jax.tree.map(lambda x: x[indices], batch)
         gradient, metrics = jax.grad(loss_of, has_aux=True)(params, data)
         if config.schedule == "adaptive":
-            learning_rate = adapt_learning_rate(
-                learning_rate, metrics["kl"], config.target_kl, config.min_learning_rate, config.max_learning_rate
-            )
+            learning_rate = adapt(learning_rate, metrics["kl"])
         metrics["gradient_norm"] = optax.tree.norm(gradient)
         updates, optimizer_state = optimizer.update(gradient, optimizer_state)
         actor_parameters, critic_parameters = jax.tree.map(lambda p, u: p - learning_rate * u, params, updates)
@@ -232,9 +234,7 @@ def improve(
     )
     metrics = {name: value.mean() for name, value in metrics.items()} | {"kl_final": metrics["kl"][-1].mean()}
     if config.schedule == "adaptive_iteration":
-        learning_rate = adapt_learning_rate(
-            learning_rate, metrics["kl_final"], config.target_kl, config.min_learning_rate, config.max_learning_rate
-        )
+        learning_rate = adapt(learning_rate, metrics["kl_final"])
     metrics["learning_rate"] = learning_rate
     metrics["std"] = jnp.exp(old_log_std).mean()
     new_policy = dataclasses.replace(policy, actor=params[0], critic=params[1])
