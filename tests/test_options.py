@@ -65,7 +65,7 @@ def test_no_settings_change_nothing():
         ("ppo=3", "--set: ppo: expected a table of settings"),
         ("ppo.epochs=many", "--set: ppo: epochs: expected int, found 'many'"),
         ("ppo.epochs=", "--set: ppo: epochs: expected int, found None"),
-        ("ppo.schedule=cosine", "--set: ppo: schedule: found 'cosine', accepted: adaptive, adaptive_iteration, fixed"),
+        ("physics.engine=fast", "--set: physics: engine: found 'fast', accepted: auto, native, mjx, mjx-warp"),
         ("ppo.actor_layers=[1", "--set ppo.actor_layers=[1: '[1' is no value"),
     ],
 )

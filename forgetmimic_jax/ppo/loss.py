@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from forgetmimic_jax.config import Config
+from forgetmimic_jax.config import Config, PPOConfig
 from forgetmimic_jax.ppo.network import entropy, log_prob
 
 
@@ -85,3 +85,9 @@ def adapt_learning_rate(
     """÷1.5 above twice the target KL, ×1.5 below half of it, inside the bounds."""
     factor = jnp.where(kl > 2.0 * target_kl, 1.0 / 1.5, jnp.where((kl < 0.5 * target_kl) & (kl > 0.0), 1.5, 1.0))
     return jnp.clip(learning_rate * factor, min_learning_rate, max_learning_rate)
+
+
+def anneal_learning_rate(config: PPOConfig, progress: Array) -> Array:
+    """From `learning_rate` linearly down to `min_learning_rate` [] as progress [] through the run goes from 0 to 1."""
+    left = jnp.maximum(1.0 - progress, 0.0)
+    return config.min_learning_rate + left * (config.learning_rate - config.min_learning_rate)

@@ -282,6 +282,15 @@ def test_once_an_iteration_the_schedule_follows_the_last_epochs_kl(problem):
         assert float(after.learning_rate) == pytest.approx(learning_rate * factor)
 
 
+def test_the_linear_schedule_is_where_the_run_is(problem):
+    env, state, batch, advantage, target = problem
+    ppo = dataclasses.replace(env.config.ppo, schedule="linear", learning_rate=1e-3, min_learning_rate=0.0)
+    config = dataclasses.replace(env.config, iterations=10, ppo=ppo)
+    run = SimpleNamespace(config=config, robot=env.robot, assets=env.assets)
+    after, _ = improved(run, dataclasses.replace(state, iteration=jnp.int32(6)), batch, advantage, target)
+    assert float(after.learning_rate) == pytest.approx(3e-4)
+
+
 def test_ended_episodes_and_steps_are_counted_clip_by_clip(run):
     flat = np.zeros((2, 3))
     done = np.array([[0, 1, 0], [0, 0, 1]], bool)
