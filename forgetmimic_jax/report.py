@@ -34,11 +34,9 @@ class Options:
     retrained: Path | None = None
     """Run of `make unlearn ARGS='--method retrain'` with the same targets and evaluation, to compare with."""
     relearning: Path | None = None
-    """JSON of the study experiments/relearning.py with the same targets: how fast the unlearned and a retrained policy
-    relearn them."""
+    """JSON of experiments/relearning.py with the same targets: how fast unlearned and retrained policy relearn them."""
     films: int = 4
-    """Clips to show as films of at most 4 s: the targets, then those the base does best; taken from the run's videos/
-    or else filmed."""
+    """Clips to film for at most 4 s: the targets, then those the base does best; one in the run's videos/ is taken."""
     output: Path | None = None
     """HTML file to write, with a .json beside it; report.html in the run by default."""
 
@@ -235,7 +233,7 @@ def _done(document: Mapping[str, Any], info: CheckpointInfo, base: CheckpointInf
     steps = budget.get("unlearned", {}).get("environment_steps", info.environment_steps)
     done |= {
         "Budget": f"{info.iteration:,} iterations, {steps:,.0f} environment steps, {config.ppo.num_envs} environments",
-        "Base's training": f"{base.iteration:,} iterations, {base.environment_steps:,} environment steps"
+        "Base's training": f"{base.environment_steps:,} environment steps"
         if base.environment_steps
         else "unknown: an imported policy",
         "Sampler": f"{config.sampling.rule.replace('_', ' ')}, from {config.sampling.clips} clips",
@@ -377,7 +375,7 @@ def _identity(document: Mapping[str, Any], info: CheckpointInfo, base: Checkpoin
 def _films(
     options: Options, document: Mapping[str, Any], info: CheckpointInfo, base: CheckpointInfo
 ) -> tuple[list[dict[str, str]], str]:
-    """Films as base64 with captions, and why there are none or fewer."""
+    """Films and their posters as base64 with captions, and why there are none or fewer."""
     from forgetmimic_jax.comparison import load_comparison
     from forgetmimic_jax.console import progress
     from forgetmimic_jax.viewing import film
@@ -410,7 +408,11 @@ def _films(
                     report(done, 0, {})
     roles = {clip: "to be forgotten" if clip in document["targets"] else "to be kept" for clip in chosen}
     films = [
-        {"data": base64.b64encode(contents[clip]).decode(), "caption": f"{clip} ({roles[clip]})"}
+        {
+            "mp4": base64.b64encode(contents[clip]).decode(),
+            "poster": base64.b64encode(film.poster(contents[clip])).decode(),
+            "caption": f"{clip} ({roles[clip]})",
+        }
         for clip in chosen
         if clip in contents
     ]

@@ -34,8 +34,10 @@ class Options:
     targets: str | None = None
     """Clips to forget, comma-separated; the library's default targets (g1: punch,kick) by default."""
     method: str = "arft"
-    """How: arft (the paper's), retrain, finetune, random_reward, decremental, poisoning, trajdeleter, negated_reward,
-    gradient_ascent or policy_edit, each a file of forgetmimic_jax/unlearning."""
+    """How, by the name of a file of forgetmimic_jax/unlearning:
+    arft (the paper's), retrain, finetune, random_reward,
+    negated_reward, gradient_ascent, trajdeleter,
+    poisoning, decremental or policy_edit."""
     penalty: float = 16.0
     """Penalty λ of arft on the targets' normalised tracking reward; W = 8 is the paper's edge."""
     sampler: Literal["uniform_clips", "uniform_bins", "frozen", "adaptive"] | None = None

@@ -1,4 +1,4 @@
-"""Anti-reward fine-tuning: the paper's method ("ForgetMimic", equation of R_anti), tracking a target clip costs.
+"""Anti-reward fine-tuning, the paper's method ("ForgetMimic", equation of R_anti): tracking a target clip costs.
 
 R' = R_track + R_reg − λ r̄ on steps of a target clip, so R'_target = (1 − λ/W) R_track + R_reg. Nothing else changes.
 """

@@ -26,6 +26,7 @@ LEAN = 0.5  # m, how far the camera looks from the robot towards the reference
 INK, PAPER, GREY = (28, 32, 38), (255, 255, 255), (110, 118, 128)
 RED, TARGET = (208, 32, 42), (176, 84, 0)
 BORDER = 5  # pixels of the red frame after the end
+GAP = 6  # pixels between the stills of a contact sheet
 
 
 def pane_renderer(robot: str) -> Renderer:
@@ -82,8 +83,13 @@ def stills(frames: Sequence[np.ndarray], count: int = 6) -> list[np.ndarray]:
 
 def contact_sheet(rows: Sequence[Sequence[np.ndarray]]) -> bytes:
     """A PNG with a row of pictures [height, width, 3] a clip; every row has as many, of the same size."""
+    height, width, _ = rows[0][0].shape
+    sheet = Image.new("RGB", (len(rows[0]) * (width + GAP) - GAP, len(rows) * (height + GAP) - GAP), PAPER)
+    for i, row in enumerate(rows):
+        for j, picture in enumerate(row):
+            sheet.paste(Image.fromarray(picture), (j * (width + GAP), i * (height + GAP)))
     buffer = io.BytesIO()
-    Image.fromarray(np.concatenate([np.concatenate(row, axis=1) for row in rows])).save(buffer, format="PNG")
+    sheet.save(buffer, format="PNG")
     return buffer.getvalue()
 
 
@@ -100,6 +106,15 @@ def mp4(frames: Iterable[np.ndarray], fps: float = FPS) -> bytes:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
         if stream is not None:
             container.mux(stream.encode(None))
+    return buffer.getvalue()
+
+
+def poster(film: bytes) -> bytes:
+    """A JPEG of the picture in the middle of an MP4: what stands for the film on paper, and until it plays."""
+    with av.open(io.BytesIO(film)) as container:
+        pictures = [picture.to_image() for picture in container.decode(video=0)]
+    buffer = io.BytesIO()
+    pictures[len(pictures) // 2].save(buffer, format="JPEG", quality=85)
     return buffer.getvalue()
 
 

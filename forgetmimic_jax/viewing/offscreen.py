@@ -16,7 +16,8 @@ import numpy as np
 from forgetmimic_jax.errors import InputError
 from forgetmimic_jax.robot import VISUAL_GROUP, read_spec
 
-GHOST_ALPHA = 0.28
+GHOST_ALPHA = 0.2
+GHOST_FADE = 0.8  # m from the robot, from where the ghost pales; at twice that it is gone, lest it hide the robot
 GHOST_TINT = np.array([0.25, 0.65, 0.45])  # what the reference's colours are mixed with, half and half
 CAMERA_DISTANCE = 2.9  # m
 CAMERA_ELEVATION = -14.0  # degrees
@@ -84,7 +85,7 @@ class Renderer:
 
         Args:
             qpos: [nq] of the robot.
-            reference: [nq] of the ghost; None: no ghost.
+            reference: [nq] of the ghost, which pales as it gets away from the robot; None: no ghost.
             look_at: [2] m, the point of the floor that the camera looks over.
             azimuth: of the camera's gaze, degrees.
 
@@ -95,16 +96,23 @@ class Renderer:
         camera.lookat[:] = [*look_at, CAMERA_HEIGHT]
         camera.distance, camera.azimuth, camera.elevation = CAMERA_DISTANCE, azimuth, CAMERA_ELEVATION
         everything, moving = mujoco.mjtCatBit.mjCAT_ALL, mujoco.mjtCatBit.mjCAT_DYNAMIC
+        shadowless = mujoco.mjtCatBit.mjCAT_DECOR
         scene, perturbation = self._scene, mujoco.MjvPerturb()
         self._pose(qpos)
         mujoco.mjv_updateScene(self._model, self._data, self._option, perturbation, camera, everything, scene)
+        for geom in scene.geoms[: scene.ngeom]:
+            if geom.type == mujoco.mjtGeom.mjGEOM_PLANE:
+                geom.category = shadowless  # a floor shadows itself, in specks
         if reference is not None:
             solid = scene.ngeom
+            apart = float(np.linalg.norm(reference[:2] - qpos[:2]))
+            alpha = GHOST_ALPHA * float(np.clip(2.0 - apart / GHOST_FADE, 0.0, 1.0))
             self._pose(reference)
             mujoco.mjv_addGeoms(self._model, self._data, self._option, perturbation, moving, scene)
             for geom in scene.geoms[solid : scene.ngeom]:
+                geom.category = shadowless
                 geom.rgba[:3] = 0.5 * (geom.rgba[:3] + GHOST_TINT)
-                geom.rgba[3] = GHOST_ALPHA
+                geom.rgba[3] = alpha
         for light in scene.lights[: scene.nlight]:
             if not light.headlight:
                 light.pos[:] = camera.lookat + LIGHT_FROM

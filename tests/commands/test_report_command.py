@@ -1,12 +1,16 @@
+import base64
 import dataclasses
+import io
 import json
 import re
 import shutil
 from html.parser import HTMLParser
 from pathlib import Path
 
+import numpy as np
 import pytest
 from miniature import finished
+from PIL import Image
 
 from forgetmimic_jax import report, unlearn
 from forgetmimic_jax.checkpoint import policy_hash, read_info
@@ -14,7 +18,9 @@ from forgetmimic_jax.config import load_config
 from forgetmimic_jax.errors import InputError
 from forgetmimic_jax.evaluation.verdict import RULES
 from forgetmimic_jax.options import override, parse
-from forgetmimic_jax.viewing import offscreen
+from forgetmimic_jax.viewing import film, offscreen
+
+FILM = [np.full((48, 64, 3), grey, np.uint8) for grey in (0, 128, 255)]
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +28,7 @@ def run(unlearned_run, tmp_path_factory) -> Path:
     """The miniature run with a film of one clip, as `make video` leaves it."""
     folder = Path(shutil.copytree(unlearned_run.folder, tmp_path_factory.mktemp("reported") / "run"))
     (folder / "videos").mkdir()
-    (folder / "videos" / "turn.mp4").write_bytes(b"a film")
+    (folder / "videos" / "turn.mp4").write_bytes(film.mp4(FILM))
     return folder
 
 
@@ -72,10 +78,10 @@ def test_the_page_tells_what_was_asked_done_and_found(page, run, base_run):
     text = re.sub(r"\s+", " ", page)
     for said in (
         "is to forget turn and to keep the other 2 clips (nod, sway).",
-        "arft: Anti-reward fine-tuning",
+        "arft: Anti-reward fine-tuning, the paper&#39;s method",
         "<th>Penalty λ</th><td>16</td>",
         "2 iterations, 64 environment steps, 8 environments",
-        "4 iterations, 128 environment steps",
+        "<th>Base&#39;s training</th><td>128 environment steps</td>",
         "0 (unlearning), 0 (evaluation)",
         "3 episodes a clip with deterministic actions",
         "Clip by clip"[:4],
@@ -88,14 +94,17 @@ def test_the_page_tells_what_was_asked_done_and_found(page, run, base_run):
     ):
         assert said in text, said
     assert page.count("<svg") == 3
-    assert 'src="data:video/mp4;base64,YSBmaWxt"' in page
+    film = base64.b64encode((run / "videos" / "turn.mp4").read_bytes()).decode()
+    assert f'src="data:video/mp4;base64,{film}"' in page
+    still = base64.b64decode(re.search(r'poster="data:image/jpeg;base64,([^"]+)"', page)[1])
+    assert np.abs(np.asarray(Image.open(io.BytesIO(still)), int) - FILM[1]).max() < 8, "its middle"
     assert "certif" not in page.lower()
 
 
 def test_the_tables_are_those_of_the_evaluation(page, run):
     document = json.loads((run / "evaluation.json").read_text())
     mean = document["policies"]["unlearned"]["clips"]["turn"]["survival_weighted_tracking"]["mean"]
-    assert re.search(rf'<tr class="target">\s*<td>turn</td><td>target</td>.*→ {mean:.3f} \[', page)
+    assert re.search(rf'<tr class="target">\s*<td>turn</td><td>target</td>.*→ {mean:.3f}\u00a0\[', page)
 
 
 def test_the_facts_lie_beside_it(facts, run):
@@ -177,8 +186,6 @@ def test_clips_without_a_film_are_filmed(run, tmp_path, monkeypatch):
         offscreen.check_rendering()
     except InputError as error:
         pytest.skip(str(error))
-    from forgetmimic_jax.viewing import film
-
     monkeypatch.setattr(film, "PANE", (96, 96))
     monkeypatch.setattr(report, "FILM_SECONDS", 0.1)
     output = tmp_path / "report.html"

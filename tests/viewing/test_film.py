@@ -71,6 +71,26 @@ def test_the_reference_is_a_translucent_ghost(renderer, robot):
     assert with_ghost[greener].mean() > 100, "the floor behind it shines through"
 
 
+def test_the_ghost_casts_no_shadow_and_pales_as_it_gets_away(renderer, robot):
+    qpos = standing(robot).takes["base"].qpos[0]
+    alone = renderer.picture(qpos, None, np.zeros(2), 215.0).astype(int)
+
+    def seen(apart: float) -> np.ndarray:
+        reference = qpos + apart * np.eye(len(qpos))[1]
+        return np.abs(renderer.picture(qpos, reference, np.zeros(2), 215.0).astype(int) - alone).sum(-1)
+
+    near, far, gone = (seen(offscreen.GHOST_FADE * share) for share in (0.9, 1.8, 2.1))
+    assert near.max() > 2 * far.max() > 0
+    assert gone.max() == 0
+
+
+def test_the_empty_floor_has_no_specks(renderer, robot):
+    away = standing(robot).takes["base"].qpos[0] + 50.0 * np.eye(7 + robot.num_joints)[0]
+    for azimuth in (100.0, 215.0, 300.0):
+        floor = renderer.picture(away, None, np.zeros(2), azimuth)[150:]
+        assert floor.min() > 150, "as light as its tiles"
+
+
 def test_a_red_frame_marks_the_end_and_stays(renderer, robot):
     frames = list(film.render_clip(renderer, standing(robot, ended=20), fps=5.0))
     framed = [bool((frame[film.HEADER, 2:-2] == RED).all() and (frame[-1, 2:-2] == RED).all()) for frame in frames]
@@ -102,8 +122,10 @@ def test_a_contact_sheet_has_a_row_a_clip(frames):
         np.testing.assert_array_equal(still, np.asarray(Image.fromarray(frames[index]).reduce(2)))
     sheet = np.asarray(Image.open(io.BytesIO(film.contact_sheet([row, row[::-1]]))))
     height, width = frames[0].shape[0] // 2, frames[0].shape[1] // 2
-    assert sheet.shape == (2 * height, 3 * width, 3)
-    np.testing.assert_array_equal(sheet[height:, :width], row[2])
+    gap = film.GAP
+    assert sheet.shape == (2 * height + gap, 3 * width + 2 * gap, 3)
+    np.testing.assert_array_equal(sheet[height + gap :, :width], row[2])
+    assert (sheet[:, width : width + gap] == 255).all()
 
 
 def test_a_film_ends_when_there_is_nothing_more_to_see(robot):
