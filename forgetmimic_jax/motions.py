@@ -169,7 +169,7 @@ def import_motion(robot: Robot, options: Import) -> None:
     _print_table([measure(robot, clip)], {})
     closing(
         {"clip": file, "library": folder},
-        f"python -m forgetmimic_jax.train --robot {robot.name} --library {folder}",
+        f"make pretrain ROBOT={robot.name} LIBRARY={folder}",
     )
 
 
@@ -187,7 +187,7 @@ def retarget(robot: Robot, options: Retarget) -> None:
     recipe.retarget_library(robot, options.source, options.output, names, report=lambda name: print(name, flush=True))
     closing(
         {"library": options.output},
-        f"python -m forgetmimic_jax.motions --robot {robot.name} check --library {options.output}",
+        f"make motions ROBOT={robot.name} ARGS='check --library {options.output}'",
     )
 
 
@@ -204,7 +204,7 @@ def check(robot: Robot, options: Check) -> None:
     failed = [quality.name for quality in measures if quality.failures()]
     closing(
         {"library": folder, **({"drawing": options.draw} if options.draw else {})},
-        f"python -m forgetmimic_jax.train --robot {robot.name} --library {folder}",
+        f"make pretrain ROBOT={robot.name} LIBRARY={folder}",
     )
     if failed:
         raise InputError(f"{folder}: {len(failed)} of {len(clips)} clips miss the bar: {', '.join(failed)}")
@@ -227,7 +227,7 @@ def show(robot: Robot, options: Show) -> None:
     _print_table([measure(robot, clips[0], cycle)], entries)
     closing(
         {"drawing": output, "clip": folder / f"{options.clip}.npz"},
-        f"python -m forgetmimic_jax.unlearn --robot {robot.name} --library {folder} --targets {options.clip}",
+        f"make unlearn ROBOT={robot.name} LIBRARY={folder} TARGETS={options.clip}",
     )
 
 
@@ -239,7 +239,7 @@ def list_clips(robot: Robot, options: List) -> None:
         print(f"{clip.name:<{width}}  {clip.seconds:7.2f} s  {entries[clip.name].get('source', '')}")
     closing(
         {"library": folder},
-        f"python -m forgetmimic_jax.motions --robot {robot.name} show {clips[0].name} --library {folder}",
+        f"make motions ROBOT={robot.name} ARGS='show {clips[0].name} --library {folder}'",
     )
 
 

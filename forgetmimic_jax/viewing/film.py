@@ -111,7 +111,7 @@ def mp4(frames: Iterable[np.ndarray], fps: float = FPS) -> bytes:
 
 def poster(film: bytes) -> bytes:
     """A JPEG of the picture in the middle of an MP4: what stands for the film on paper, and until it plays."""
-    with av.open(io.BytesIO(film)) as container:
+    with av.open(io.BytesIO(film), "r") as container:
         pictures = [picture.to_image() for picture in container.decode(video=0)]
     buffer = io.BytesIO()
     pictures[len(pictures) // 2].save(buffer, format="JPEG", quality=85)

@@ -51,7 +51,7 @@ def test_import_makes_a_library_that_loads(run, robot, motion_file):
     code, out, _ = run("--robot", "g1", "import", motion_file, "--name", "first", "--library", "mine")
     assert code == 0
     assert "mine" in out
-    assert "Next: python -m forgetmimic_jax.train --robot g1 --library mine" in out
+    assert "Next: make pretrain ROBOT=g1 LIBRARY=mine" in out
     loaded = library.load_library(robot, motion_file.parent / "mine")
     assert loaded.names == ("first",)
     assert loaded.length.tolist() == [101]  # 2 s at 50 Hz, both ends
