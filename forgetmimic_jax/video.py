@@ -31,6 +31,8 @@ class Options:
     """Clips to film, comma-separated; all of the library by default."""
     seconds: float = 10.0
     """Longest film, s; a film ends sooner where the clip does, or once every policy has fallen."""
+    stills: int = 6
+    """Pictures of each clip on the page of stills, from its start to its end."""
     seed: int = 0
     """Seed of the reset noise; the same for every policy."""
     library: Path | None = None
@@ -51,6 +53,7 @@ def main(options: Options) -> None:
     from forgetmimic_jax.viewing.offscreen import check_rendering
     from forgetmimic_jax.viewing.side_by_side import record
 
+    at_least(1, "--stills", options.stills)
     at_least(0, "--seed", options.seed)
     if not options.seconds > 0:
         raise InputError(f"--seconds: found {options.seconds:g}; accepted: above 0")
@@ -81,7 +84,7 @@ def main(options: Options) -> None:
                 report(drawn, 0, {})
             write_atomically(output / f"{episode.clip}.mp4", film.mp4(frames))
             write_atomically(output / f"{episode.clip}.gif", film.gif(frames))
-            sheet.append(film.stills(frames))
+            sheet.append(film.stills(frames, options.stills))
     write_atomically(output / "contact_sheet.png", film.contact_sheet(sheet))
     Console().print(_table(episodes, compared.targets))
     chosen = f" CHECKPOINT={path}" if options.checkpoint else ""

@@ -75,7 +75,7 @@ def render_clip(
         yield np.asarray(frame)
 
 
-def stills(frames: Sequence[np.ndarray], count: int = 6) -> list[np.ndarray]:
+def stills(frames: Sequence[np.ndarray], count: int) -> list[np.ndarray]:
     """`count` frames of a film, evenly spread from the first to the last, at half the size."""
     chosen = np.linspace(0, len(frames) - 1, count).round().astype(int)
     return [np.asarray(Image.fromarray(frames[index]).reduce(2)) for index in chosen]

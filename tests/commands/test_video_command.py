@@ -28,7 +28,9 @@ def test_base_and_unlearned_policy_are_filmed_side_by_side(unlearned_run, tmp_pa
         pytest.skip(str(error))
     monkeypatch.setattr(film, "PANE", (160, 160))
     output = tmp_path / "new" / "films"
-    options = video.Options(checkpoint=unlearned_run.checkpoint(2), clips="turn, nod", seconds=0.12, output=output)
+    options = video.Options(
+        checkpoint=unlearned_run.checkpoint(2), clips="turn, nod", seconds=0.12, stills=3, output=output
+    )
     printed = finished(video.main, options).printed.splitlines()
     names = ["contact_sheet.png", "nod.gif", "nod.mp4", "turn.gif", "turn.mp4"]
     assert sorted(path.name for path in output.iterdir()) == names
@@ -36,7 +38,8 @@ def test_base_and_unlearned_policy_are_filmed_side_by_side(unlearned_run, tmp_pa
         pictures = list(container.decode(video=0))
     assert [(picture.width, picture.height) for picture in pictures] == [(2 * 160, 160 + film.HEADER)] * 4
     assert Image.open(output / "nod.gif").n_frames == 2
-    assert Image.open(output / "contact_sheet.png").size == (6 * 160, 2 * (160 + film.HEADER) // 2)
+    width, height, gap = 160, (160 + film.HEADER) // 2, film.GAP
+    assert Image.open(output / "contact_sheet.png").size == (3 * width + 2 * gap, 2 * height + gap)
     assert "base: tracking" in "".join(printed)
     assert [line.split()[:2] for line in printed if line.split()[:1] in (["turn"], ["nod"])] == [
         ["turn", "target"],
@@ -53,6 +56,7 @@ def test_base_and_unlearned_policy_are_filmed_side_by_side(unlearned_run, tmp_pa
         ({"clips": "trun"}, "--clips: no clip 'trun' in the library; did you mean 'turn'?"),
         ({"clips": " ,"}, "--clips: no clip named; leave the flag out for all of them"),
         ({"seconds": 0.0}, "--seconds: found 0; accepted: above 0"),
+        ({"stills": 0}, "--stills: found 0; accepted: 1 or more"),
         ({"seed": -1}, "--seed: found -1; accepted: 0 or more"),
         ({"library": Path("nowhere")}, "nowhere/manifest.json: not found; a library is a folder with manifest.json"),
         ({"output": Path(__file__)}, f"{__file__}: {__file__} is a file; choose another --output"),
