@@ -44,6 +44,7 @@ class CheckpointInfo:
     iteration: int
     environment_steps: int
     files: dict[str, str]  # sha256 of each file of the trees
+    base: str | None  # `policy_hash` of the checkpoint that unlearning started from
 
 
 def save_checkpoint(
@@ -55,6 +56,7 @@ def save_checkpoint(
     library_hash: str,
     *,
     environment_steps: int,
+    base: str | None = None,
     resumable: bool = True,
 ) -> None:
     """Write a run's state to folder `path`; one of the same name is replaced only once the new one is complete.
@@ -70,6 +72,7 @@ def save_checkpoint(
         library_hash: of those clips.
         environment_steps: control steps lived so far, all environments together, with those of the base that
             training went on from.
+        base: of an unlearning run, the `policy_hash` of the checkpoint it started from.
         resumable: with `run/`; without, the checkpoint is small and serves evaluation and warm starts only.
 
     Raises:
@@ -87,6 +90,7 @@ def save_checkpoint(
         "library_hash": library_hash,
         "iteration": int(state.iteration),
         "environment_steps": environment_steps,
+        "base": base,
     }
     for abandoned in path.parent.glob(".*.tmp"):
         shutil.rmtree(abandoned, ignore_errors=True)
@@ -135,6 +139,7 @@ def read_info(path: Path) -> CheckpointInfo:
             iteration=int(meta["iteration"]),
             environment_steps=int(meta["environment_steps"]),
             files=dict(meta.get("files", {})),
+            base=meta.get("base"),
         )
     except FileNotFoundError:
         newest = newest_checkpoint(path)

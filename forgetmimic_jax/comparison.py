@@ -8,6 +8,7 @@ from typing import Literal
 
 from forgetmimic_jax import checkpoint, runner
 from forgetmimic_jax.checkpoint import CheckpointInfo
+from forgetmimic_jax.errors import InputError
 from forgetmimic_jax.options import on_engine, replace_given
 from forgetmimic_jax.runner import Setup
 from forgetmimic_jax.state import Policy
@@ -44,7 +45,8 @@ def load_comparison(
         physics: engine; the checkpoint's by default.
 
     Raises:
-        InputError: a checkpoint that is damaged or does not fit, or a target that is no clip.
+        InputError: a checkpoint that is damaged or does not fit, a base that was replaced since, or a target that is
+            no clip.
     """
     info = checkpoint.read_info(path)
     config = on_engine(replace_given(info.config, robot=robot, library=library), physics)
@@ -54,6 +56,12 @@ def load_comparison(
     compared = {name: info}
     if forgetful:
         compared = {"base": checkpoint.read_info(base or runner.base_checkpoint(info.config)), **compared}
+        found = checkpoint.policy_hash(compared["base"])
+        if base is None and info.base not in (None, found):
+            raise InputError(
+                f"{path}: unlearned from the policy {info.base}, but {compared['base'].path} is now {found}; name the "
+                f"base it started from with --base"
+            )
     for one in reversed(compared.values()):
         checkpoint.check_matches(one, setup.robot, setup.library, setup.library_hash, config)
     targets = info.config.unlearn.targets if targets is None else targets

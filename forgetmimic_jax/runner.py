@@ -221,6 +221,7 @@ def run(
     mean survival-weighted tracking. Ctrl-C and SIGTERM end the current iteration, save, and raise Interrupted.
     """
     config = setup.config
+    base = checkpoint.policy_hash(checkpoint.read_info(base_checkpoint(config))) if config.unlearn.targets else None
     newest = prepare_folder(directory, resume=resume)
     if newest is None:
         state, environment_steps = start_state(setup), _steps_before(config)
@@ -246,6 +247,7 @@ def run(
             setup.library,
             setup.library_hash,
             environment_steps=environment_steps,
+            base=base,
             resumable=not best,
         )
         for old in checkpoint.checkpoints(directory)[:-KEEP]:

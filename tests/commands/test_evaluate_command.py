@@ -6,6 +6,8 @@ import pytest
 from miniature import finished
 
 from forgetmimic_jax import evaluate
+from forgetmimic_jax.checkpoint import policy_hash, read_info
+from forgetmimic_jax.comparison import load_comparison
 from forgetmimic_jax.options import on_engine, parse
 from forgetmimic_jax.physics.engine import resolve_engine
 
@@ -44,6 +46,19 @@ def test_it_ends_with_the_files_and_what_to_do_next(evaluated_again):
     assert printed[0] == "evaluate: 0/3"
     assert f"evaluation  {evaluated_again.folder}/evaluation.json" in printed
     assert printed[-1] == "Next: make unlearn ROBOT=g1"
+
+
+def test_a_base_that_was_replaced_since_is_told_unless_it_was_named(refused, unlearned_run, base_run, tmp_path):
+    copy = Path(shutil.copytree(unlearned_run.checkpoint(2), tmp_path / "copy"))
+    meta = json.loads((copy / "meta.json").read_text())
+    found = policy_hash(read_info(base_run.checkpoint(4)))
+    assert meta["base"] == found
+    (copy / "meta.json").write_text(json.dumps(meta | {"base": "0123456789abcdef"}))
+    assert refused(evaluate.main, evaluate.Options(checkpoint=copy, output=Path("out"))) == (
+        f"{copy}: unlearned from the policy 0123456789abcdef, but {base_run.checkpoint(4)} is now {found}; name the "
+        f"base it started from with --base"
+    )
+    assert load_comparison(copy, robot="g1", base=base_run.checkpoint(4)).info["base"].base is None
 
 
 @pytest.mark.parametrize(
