@@ -1,9 +1,10 @@
-"""What is noise in a policy gradient of the shipped base, and what removes it: `python experiments/gradient_noise.py`.
+"""How noisy and how biased the policy gradient is under each λ of GAE: `python experiments/gradient_noise.py`.
 
 From each of many states the policy meets, BRANCHES rollouts set out with different action noise. The spread of their
 advantages inside such a group is what the actions did; the spread of the groups' means is the critic's error in the
-state, which says nothing about actions. A group's own estimate of the gradient of the first action's mean, split into
-halves that share no rollout, tells the true gradient's square and the angle between the gradients of two λ.
+state, which says nothing about actions. The gradient in the actor's parameters is then taken batch by batch for every
+look-ahead and λ. Products of different batches' gradients hold no noise, so their means tell the true gradient's
+square, and the angle to the gradient of λ = 1 with the longest look-ahead, which leans on the critic least.
 `--draw` rewrites the page from the stored numbers alone.
 """
 
@@ -20,128 +21,160 @@ import numpy as np
 HERE = Path(__file__).parent
 RESULT = HERE / "results" / "gradient_noise.json"
 PAGE = HERE / "gradient_noise.md"
-BRANCHES, STEPS, ROUNDS, SETTLING = 16, 32, 40, 4
-LAMBDAS = (0.0, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 1.0)
-GROUP, ROLLOUT = 4, 8  # the cpu preset's branches and num_steps
+ENVIRONMENTS, BRANCHES, STEPS, BATCHES = 1024, 16, 40, 40
+USED = 4  # first steps of a rollout whose actions the gradient is of: 4,096 samples a batch
+LAMBDAS = (0.5, 0.7, 0.8, 0.9, 0.95, 1.0)
+LOOK_AHEADS = (4, 8, 16, STEPS)
 
-TEXT = """# Where the noise of a policy gradient comes from
+TEXT = """# The policy gradient's noise and bias
 
-The shipped base (`data/g1/base`, {environment_steps:,} environment steps): {groups} states it meets in training,
-{branches} rollouts of {steps} control steps from each; seed 0. `python experiments/gradient_noise.py` measures it again
-(some minutes on two cores), `--draw` rewrites this page from `results/gradient_noise.json`.
+The policy `{policy}` ({environment_steps:,} environment steps, trained with λ = {trained_lambda:g}): {groups} states it
+meets in training, {branches} rollouts of {steps} control steps from each; seed 0.
+`python experiments/gradient_noise.py CHECKPOINT` measures it again (some ten minutes on two cores), `--draw` rewrites
+this page from `results/gradient_noise.json`.
 
-| λ of GAE | variance | critic's error in it | cosine | saved by branches | by branches and λ |
-|---|---|---|---|---|---|
-{rows}
+## Noise: the first step's advantage
 
-- *Variance*: of the first step's advantage, over all rollouts. *The critic's error in it*: the part between states; the
-  rest is between the rollouts of one state.
-- *Cosine*: between the gradients (of the first action's mean) with this λ and with λ = 1.
-- *Saved by branches*: by which factor the variance falls when a rollout is measured against the others of its state.
-- Empty: the square of that gradient is not above its noise in this many states.
-- *By branches and λ*: by which factor fewer samples give the same accuracy along the gradient of λ = 1, against plain
-  PPO with λ = 0.9.
+| λ of GAE | variance | critic's error in it | saved by branches |
+|---|---|---|---|
+{noise}
 
-Over a rollout of {rollout} steps in groups of {group}, as in the cpu preset, branches part and the gain shrinks: the
-mean variance falls from {raw:.4f} to {centred:.4f} (λ = {preset_lambda:g}); plain PPO with λ = 0.9 has {plain:.4f}.
-Plain PPO is `ppo.branches=1`, which the `paper` preset keeps.
+- *The critic's error in it*: the part of the variance between states; the rest is between the rollouts of one state.
+- *Saved by branches*: by which factor the variance falls when a rollout is measured against the others of its state
+  (`ppo.branches`), which leaves the gradient unbiased.
+
+## Bias: the gradient in the actor's parameters
+
+Of the actions of a rollout's first {used} steps, {samples:,} samples a batch, {batches} batches, branches centred.
+
+| look-ahead | λ | signal | cosine | efficiency |
+|---|---|---|---|---|
+{bias}
+
+- *Look-ahead*: control steps before the critic's value stands for the rest.
+- *Signal*: the share of the mean gradient's square in a batch gradient's square, in thousandths.
+- *Cosine*: between the mean gradient and that of λ = 1 with the longest look-ahead.
+- *Efficiency*: the share of a batch gradient's square along the latter, signed, in thousandths: what training can use.
+
+A small λ has the stronger signal and the wrong direction. The critic explains nearly all of what differs between the
+states of a clip, and hardly anything of what a few steps of noise change in one; only a fall tells. A policy trained
+with a small λ comes to rest where that biased gradient vanishes, and the variance, by which λ = 0.7 over 8 steps was
+once chosen for the `cpu` preset, does not show it. Hence its long rollouts with a λ near 1.
 """
 
 
-def measure() -> dict:
+def measure(checkpoint_path: Path) -> dict:
     """Roll out and take the moments."""
     import jax
+    import jax.flatten_util
     import jax.numpy as jnp
 
     from forgetmimic_jax import checkpoint, runner
+    from forgetmimic_jax.ppo import network
     from forgetmimic_jax.ppo.gae import centre_branches, generalized_advantages
     from forgetmimic_jax.ppo.update import collect
+    from forgetmimic_jax.state import make_actor
 
-    base = runner.base_folder("g1")
-    info = checkpoint.read_info(base)
-    ppo = dataclasses.replace(info.config.ppo, num_envs=256, num_steps=STEPS, branches=1)
+    info = checkpoint.read_info(checkpoint_path)
+    ppo = dataclasses.replace(info.config.ppo, num_envs=ENVIRONMENTS, num_steps=STEPS, branches=BRANCHES, minibatches=1)
     sampling = dataclasses.replace(info.config.sampling, rule="frozen")
-    setup = runner.make_setup(dataclasses.replace(info.config, base=str(base), ppo=ppo, sampling=sampling))
-    roll_out = jax.jit(lambda assets, state: collect(setup.env, assets, state))
-    state = runner.start_state(setup)
-    preset_lambda = info.config.ppo.gae_lambda
-    products, within, between, rollout = [], [], [], []
-    for round_ in range(SETTLING + ROUNDS):
-        # Every group starts where one rollout of the round before ended, a new one each time.
-        chosen = np.repeat((round_ + np.arange(0, ppo.num_envs, BRANCHES)) % ppo.num_envs, BRANCHES)
-        if round_ >= SETTLING:
-            state = dataclasses.replace(state, env=jax.tree.map(operator.itemgetter(chosen), state.env))
-        state, trajectory = roll_out(setup.assets, state)
-        if round_ < SETTLING:
-            continue
+    config = dataclasses.replace(info.config, base=str(checkpoint_path), ppo=ppo, sampling=sampling)
+    setup = runner.make_setup(config)
+    actor = make_actor(config, setup.robot.num_joints)
+    variants = [(ahead, value) for ahead in LOOK_AHEADS for value in LAMBDAS]
 
-        t = trajectory
-        parts = (t.reward, t.value, t.next_value, t.terminated, t.truncated, ppo.discount)
-        noise = np.asarray(trajectory.action - trajectory.mean)[0]
-        noise = (noise / noise.std(0)).reshape(-1, BRANCHES, noise.shape[-1])
-        first = np.stack([np.asarray(generalized_advantages(*parts, value)[0])[0] for value in LAMBDAS])
-        first = first.reshape(len(LAMBDAS), -1, BRANCHES)
-        centred = (first - first.mean(-1, keepdims=True)) * BRANCHES / (BRANCHES - 1)
-        gradient = centred[..., None] * noise  # [λ, group, branch, joint]
-        one, other = gradient[:, :, ::2].mean(2), gradient[:, :, 1::2].mean(2)
-        product = np.einsum("agj,bgj->ab", one, other) / first.shape[1]
-        products.append((product + product.T) / 2)
-        within.append(first.var(-1, ddof=1).mean(-1))
-        between.append(first.mean(-1).var(-1, ddof=1) - within[-1] / BRANCHES)
-        done = trajectory.terminated | trajectory.truncated
-        ours, plain = (generalized_advantages(*parts, value)[0][:ROLLOUT] for value in (preset_lambda, 0.9))
-        parted = centre_branches(ours, done[:ROLLOUT], GROUP)
-        rollout.append([float(jnp.var(x)) for x in (ours, parted, plain)])
-    raw, centred, plain = np.mean(rollout, axis=0).tolist()
+    @jax.jit
+    def one_batch(assets, state):
+        state, t = collect(setup.env, assets, state)
+        done = t.terminated | t.truncated
+        seen = network.normalize(state.policy.actor_normalizer, t.actor_observation[:USED])
+        parts = (t.reward, t.value, t.next_value, t.terminated, t.truncated)
+
+        def gradient(ahead: int, value: float):
+            advantage, _ = generalized_advantages(*(x[:ahead] for x in parts), ppo.discount, value)
+            advantage = centre_branches(advantage, done[:ahead], BRANCHES)[:USED]
+
+            def surrogate(parameters):
+                return (
+                    network.log_prob(t.action[:USED], *network.distribution(actor, parameters, seen)) * advantage
+                ).mean()
+
+            inner = jax.grad(surrogate)(state.policy.actor)["params"]
+            return jax.flatten_util.ravel_pytree({name: x for name, x in inner.items() if name != "log_std"})[0]
+
+        first = jnp.stack([generalized_advantages(*parts, ppo.discount, value)[0][0] for value in LAMBDAS])
+        return state, jnp.stack([gradient(*variant) for variant in variants]), first
+
+    state = runner.start_state(setup)
+    rng = np.random.default_rng(0)
+    total, square, own, truth = 0.0, 0.0, 0.0, variants.index((STEPS, 1.0))
+    within, between = [], []
+    for batch in range(1 + BATCHES):
+        state, gradients, first = one_batch(setup.assets, state)
+        # New leaders each time, so that a group sets out from where any rollout of the batch before ended.
+        order = rng.permutation(ENVIRONMENTS)
+        state = dataclasses.replace(state, env=jax.tree.map(operator.itemgetter(order), state.env))
+        if batch == 0:  # the starts' reset noise is no state that the policy meets
+            continue
+        gradients = np.asarray(gradients, np.float64)
+        total, square = total + gradients, square + (gradients**2).sum(-1)
+        own = own + gradients @ gradients[truth]
+        groups = np.asarray(first).reshape(len(LAMBDAS), -1, BRANCHES)
+        within.append(groups.var(-1, ddof=1).mean(-1))
+        between.append(groups.mean(-1).var(-1, ddof=1) - within[-1] / BRANCHES)
+    pairs = BATCHES * (BATCHES - 1)
+    signal, along = ((total**2).sum(-1) - square) / pairs, (total @ total[truth] - own) / pairs
     return {
+        "policy": "/".join(checkpoint_path.parts[-3:]),
         "environment_steps": info.environment_steps,
-        "groups": ROUNDS * ppo.num_envs // BRANCHES,
-        "branches": BRANCHES,
-        "steps": STEPS,
-        "lambda": LAMBDAS,
+        "trained_lambda": info.config.ppo.gae_lambda,
         "within": np.mean(within, axis=0).tolist(),
         "between": np.mean(between, axis=0).tolist(),
-        "products": np.mean(products, axis=0).tolist(),
-        "rollout": {"steps": ROLLOUT, "group": GROUP, "lambda": preset_lambda, "raw": raw, "centred": centred,
-                    "plain": plain},
-    }  # fmt: skip
-
-
-def number(value: float, digits: int) -> str:
-    """A cell; empty where the gradient does not stand out from its noise."""
-    return "" if np.isnan(value) else f"{value:.{digits}f}"
+        "variants": variants,
+        "square": (square / BATCHES).tolist(),
+        "signal": signal.tolist(),
+        "along_truth": along.tolist(),
+    }
 
 
 def page(found: dict) -> str:
     """The page of the stored numbers."""
     within, between = np.array(found["within"]), np.array(found["between"])
-    products = np.array(found["products"])
-    square = np.diag(products)
-    length = np.sqrt(np.where(square > 0, square, np.nan))
-    cosine = products[:, -1] / (length * length[-1])
-    projection = products[:, -1] / length[-1]
-    plain = found["lambda"].index(0.9)
     total = within + between
-    saved = (projection**2 / within) / (projection[plain] ** 2 / total[plain])
-    rows = [
-        f"| {value:g} | {total[i]:.4f} | {between[i] / total[i]:.0%} | {number(cosine[i], 2)} | "
-        f"{total[i] / within[i]:.1f} | {number(saved[i], 1)} |"
-        for i, value in enumerate(found["lambda"])
+    noise = [
+        f"| {value:g} | {total[i]:.4f} | {between[i] / total[i]:.0%} | {total[i] / within[i]:.1f} |"
+        for i, value in enumerate(LAMBDAS)
     ]
-    rollout = found["rollout"]
+    truth = found["variants"].index([STEPS, 1.0])
+    square, signal, along = (np.array(found[name]) for name in ("square", "signal", "along_truth"))
+    with np.errstate(invalid="ignore"):
+        cosine = along / np.sqrt(signal * signal[truth])
+    efficiency = np.sign(along) * along**2 / signal[truth] / square
+    bias = [
+        f"| {ahead} | {value:g} | {1e3 * signal[i] / square[i]:.1f} | {cosine[i]:.2f} | {1e3 * efficiency[i]:.1f} |"
+        for i, (ahead, value) in enumerate(found["variants"])
+    ]
     return TEXT.format(
-        **{name: found[name] for name in ("environment_steps", "groups", "branches", "steps")},
-        **{name: rollout[name] for name in ("raw", "centred", "plain", "group")},
-        rows="\n".join(rows),
-        rollout=rollout["steps"],
-        preset_lambda=rollout["lambda"],
+        **{name: found[name] for name in ("policy", "environment_steps", "trained_lambda")},
+        groups=BATCHES * ENVIRONMENTS // BRANCHES,
+        branches=BRANCHES,
+        steps=STEPS,
+        used=USED,
+        samples=USED * ENVIRONMENTS,
+        batches=BATCHES,
+        noise="\n".join(noise),
+        bias="\n".join(bias),
     )
 
 
 def main() -> None:
-    """Measure, unless told to draw only; write the numbers and the page."""
-    if "--draw" not in sys.argv[1:]:
-        RESULT.write_text(json.dumps(measure(), indent=1) + "\n")
+    """Measure a checkpoint (the shipped base by default), or with --draw only draw; write the numbers and the page."""
+    from forgetmimic_jax import runner
+
+    arguments = sys.argv[1:]
+    if "--draw" not in arguments:
+        policy = Path(arguments[0]) if arguments else runner.base_folder("g1")
+        RESULT.write_text(json.dumps(measure(policy), indent=1) + "\n")
     PAGE.write_text(page(json.loads(RESULT.read_text())))
     print(f"numbers  {RESULT}\npage     {PAGE}")
 
