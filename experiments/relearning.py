@@ -18,19 +18,19 @@ from forgetmimic_jax.evaluation.plots import new_figure
 from forgetmimic_jax.evaluation.tables import markdown_table, number
 from forgetmimic_jax.rows import read_rows
 from forgetmimic_jax.study import Lab, Study, main, newest_policy
+from forgetmimic_jax.unlearn import ITERATIONS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 EVALUATIONS = 20
 SHARES = (0.5, 0.8, 0.95)  # of the base's survival-weighted tracking on the targets
-UNLEARNING = {"cpu": 400, "paper": 1000}  # iterations
 
 
 def measure(lab: Lab) -> dict[str, Any]:
     """First the policies to start from, then their relearning."""
     starts: dict[tuple[str, int], dict[str, Any]] = {
-        ("unlearned", seed): {"seed": seed, "iterations": UNLEARNING[lab.options.budget]} for seed in lab.seeds
+        ("unlearned", seed): {"seed": seed, "iterations": ITERATIONS[lab.options.budget]} for seed in lab.seeds
     }
     retrain = {"method": "retrain", "iterations": lab.control_iterations}
     starts |= {("retrained", seed): {**retrain, "seed": seed} for seed in lab.control_seeds}
@@ -128,7 +128,7 @@ def draw(document: Mapping[str, Any]) -> Figure:
 STUDY = Study(
     name="relearning",
     title="How fast does a forgotten motion come back?",
-    iterations={"cpu": 800, "paper": 10_000},
+    iterations={"cpu": 260, "paper": 10_000},
     measure=measure,
     tell=tell,
     draw=draw,

@@ -53,7 +53,7 @@ def test_its_settings_are_the_base_s_but_for_what_unlearning_changes(base_run, u
         unlearn=found.unlearn,
         sampling=dataclasses.replace(base.sampling, rule="uniform_clips"),
         wrench=dataclasses.replace(base.wrench, max_gain=0.0),
-        ppo=dataclasses.replace(base.ppo, schedule="fixed", learning_rate=1.5e-4),
+        ppo=dataclasses.replace(base.ppo, schedule="linear", learning_rate=1.5e-4, clip_value=False),
     )
 
 
