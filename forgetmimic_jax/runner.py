@@ -325,7 +325,7 @@ def _live(metrics: Mapping[str, np.ndarray]) -> dict[str, float]:
 
 
 class _Log:
-    """metrics.jsonl and TensorBoard events: means over the iterations since the last row."""
+    """metrics.jsonl and TensorBoard events: means over the iterations since the last row, and the seconds they took."""
 
     def __init__(self, directory: Path, iteration: int, environment_steps: int):
         # TensorboardX's SummaryWriter writes from a thread, for which a run would wait forever when the disk is full.
@@ -337,6 +337,7 @@ class _Log:
         # TensorBoard hides the rows after this one that an earlier, killed process may have written.
         self._write_event(environment_steps + 1, session_log=SessionLog(status=SessionLog.START))
         self._rows: list[Mapping[str, np.ndarray]] = []
+        self._last_row = time.monotonic()
 
     def __enter__(self) -> _Log:
         return self
@@ -355,6 +356,8 @@ class _Log:
         mean = {name: np.mean([row[name] for row in rows], axis=0) for name in rows[0]}
         out: dict[str, Any] = {"iteration": iteration, "environment_steps": environment_steps}
         out |= {name: float(value) for name, value in mean.items() if np.ndim(value) == 0}
+        now = time.monotonic()
+        out["seconds"], self._last_row = round(now - self._last_row, 2), now
         episodes = np.maximum(mean["clip/episodes"], 1e-9)
         steps = np.maximum(mean["clip/steps"], 1e-9)
         per_clip = {
