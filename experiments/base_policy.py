@@ -61,7 +61,7 @@ survival-weighted tracking (success) at the environment steps since the start.
   noise). At a KL of 0.08 evaluations wander by 0.03; a smaller step size settles them. Hence the preset's schedule.
 - *Level* stands still whatever the step size: λ = 0.7 has brought the policy to where its own gradient vanishes, which
   is not where the true one does ([the gradient's bias](gradient_noise.md)). *Short*, which trusts the critic sooner
-  still, is the worse policy. *Long* pays for a truer direction with noise, and goes on improving; it is the preset's.
+  still, is the worse policy. *Long* and *longer* pay for a truer direction with noise, and improve again.
 """
 GOING_ON = {
     "plain": ("base of 6.0 M steps", "`num_envs=256 num_steps=16 gae_lambda=0.9 learning_rate=2e-4`"),
@@ -80,6 +80,7 @@ GOING_ON = {
         "*level* after 4.8 M",
         "as *level*, `num_steps=24 minibatches=12 gae_lambda=0.95 schedule=linear learning_rate=5e-5`",
     ),
+    "longer": ("*long* after 4.1 M", "as *long*, `num_envs=256 num_steps=48 gae_lambda=0.97 learning_rate=4e-5`"),
 }
 
 
@@ -89,7 +90,7 @@ def going_on() -> str:
     for name, (start, settings) in GOING_ON.items():
         lines = (RESULTS / f"going_on_{name}.jsonl").read_text().splitlines()
         evaluations = [json.loads(line) for line in lines]
-        steps_per_iteration = 12_288 if name == "long" else 4096
+        steps_per_iteration = 12_288 if "long" in name else 4096
         cells = [
             f"{row['iteration'] * steps_per_iteration / 1e6:.1f} M: {row['survival_weighted_tracking']:.2f} "
             f"({row['success_rate']:.0%})"

@@ -30,7 +30,7 @@ def measure(lab: Lab) -> dict[str, Any]:
     """Every method and the ablation; a retrained policy as often as the budget allows."""
     retrain = {"retrained": {"method": "retrain", "iterations": lab.control_iterations}}
     arft = {f"arft, {label}": variant for label, variant in ablation().items()}
-    return lab.over_seeds({**retrain, **METHODS, **arft}, "comparison", seeds={"retrained": lab.control_seeds})
+    return lab.over_seeds({**METHODS, **arft, **retrain}, "comparison", seeds={"retrained": lab.control_seeds})
 
 
 def tell(document: Mapping[str, Any]) -> str:

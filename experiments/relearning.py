@@ -18,7 +18,7 @@ from forgetmimic_jax.evaluation.plots import new_figure
 from forgetmimic_jax.evaluation.tables import markdown_table, number
 from forgetmimic_jax.rows import read_rows
 from forgetmimic_jax.study import Lab, Study, main, newest_policy
-from forgetmimic_jax.unlearn import ITERATIONS
+from forgetmimic_jax.unlearn import ITERATIONS, PACE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -37,14 +37,16 @@ def measure(lab: Lab) -> dict[str, Any]:
     folders = lab.run(starts, "policies to relearn from")
     base = _on_targets(json.loads(next(iter(folders.values())).joinpath("evaluation.json").read_text()), lab.targets)
     every = max(1, lab.iterations // EVALUATIONS)
-    watched = {"clips": "all", "set": [f"evaluate_every={every}"]}
+    # A start's own settings would be its training's: all of them relearn at the same fixed pace.
+    alike = ["ppo.schedule=fixed", f"ppo.learning_rate={PACE['learning_rate']}", "ppo.clip_value=false"]
+    alike += ["wrench.max_gain=0.0"]
+    watched = {"clips": "all", "set": [f"evaluate_every={every}", *alike]}
     relearn: dict[tuple[str, int], dict[str, Any]] = {
         (label, seed): {**watched, "method": "finetune", "base": newest_policy(folder), "seed": seed}
         for (label, seed), folder in folders.items()
     }
-    alike = [*watched["set"], "wrench.max_gain=0.0"]  # a fresh policy would be trained as the base was
     relearn |= {
-        ("fresh", seed): {**watched, "method": "retrain", "sampler": "uniform_clips", "set": alike, "seed": seed}
+        ("fresh", seed): {**watched, "method": "retrain", "sampler": "uniform_clips", "seed": seed}
         for seed in lab.seeds
     }
     curves: dict[str, Any] = {}

@@ -39,10 +39,13 @@ def measure(lab: Lab) -> dict[str, Any]:
     runs = lab.run(asked, "training dynamics")
     result = {}
     for label in CONFIGURATIONS:
-        logs = [read_rows(folder / "metrics.jsonl") for (of, _), folder in runs.items() if of == label]
+        folders = [folder for (of, _), folder in runs.items() if of == label]
+        logs = [{row["iteration"]: row for row in read_rows(folder / "metrics.jsonl")} for folder in folders]
         if logs:
-            rows = [over_seeds([{name: row[name] for name in CURVES} for row in at]) for at in zip(*logs, strict=True)]
-            result[label] = {"iterations": [row["iteration"] for row in logs[0]], "rows": rows}
+            # A run that was stopped and went on has a row more, at the iteration where it was stopped.
+            common = sorted(set(logs[0]).intersection(*logs))
+            rows = [over_seeds([{name: log[at][name] for name in CURVES} for log in logs]) for at in common]
+            result[label] = {"iterations": common, "rows": rows}
     return {"configurations": result}
 
 

@@ -119,6 +119,11 @@ def save_checkpoint(
         shutil.rmtree(temporary, ignore_errors=True)
 
 
+def fingerprint(path: Path) -> str:
+    """SHA-256 of what a checkpoint says of itself: another policy, or other settings, give another."""
+    return hashlib.sha256((path / META).read_bytes() + (path / CONFIG).read_bytes()).hexdigest()
+
+
 def read_info(path: Path) -> CheckpointInfo:
     """A checkpoint's note and config.
 

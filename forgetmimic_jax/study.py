@@ -6,7 +6,6 @@ of the others (`trials`); one whose JSON already answers what is asked runs noth
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 import json
 import sys
@@ -133,11 +132,11 @@ class Lab:
 
     def asked(self) -> dict[str, Any]:
         """What a result is the answer to."""
-        from forgetmimic_jax.checkpoint import META
+        from forgetmimic_jax.checkpoint import fingerprint
 
         return {
             "robot": self.options.robot,
-            "base": hashlib.sha256((self.base / META).read_bytes()).hexdigest()[:16],
+            "base": fingerprint(self.base)[:16],
             "base_environment_steps": self.info.environment_steps,
             "library": self.info.library_hash,
             "targets": list(self.targets),

@@ -62,8 +62,7 @@ def make_trial(root: Path, options: Mapping[str, Any]) -> Trial:
     them is not part of it: after a change of the code, remove the folder.
     """
     asked = {name: value for name, value in options.items() if value != DEFAULTS[name]}
-    base = hashlib.sha256((Path(options["base"]) / checkpoint.META).read_bytes()).hexdigest()
-    content = json.dumps({**asked, "base": base}, sort_keys=True, default=str)
+    content = json.dumps({**asked, "base": checkpoint.fingerprint(Path(options["base"]))}, sort_keys=True, default=str)
     digest = hashlib.sha256(content.encode()).hexdigest()[:8]
     shown = ("penalty", "sampler", "wrench", "clips", "targets")
     words = [str(options.get("method", "arft")), *(f"{name}_{asked[name]}" for name in shown if name in asked)]

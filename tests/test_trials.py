@@ -127,9 +127,14 @@ def test_a_folder_without_a_checkpoint_is_begun_anew(tmp_path):
 
 @pytest.fixture
 def base(tmp_path) -> Path:
-    (tmp_path / "base").mkdir()
-    (tmp_path / "base" / "meta.json").write_text("one")
-    return tmp_path / "base"
+    return written(tmp_path / "base")
+
+
+def written(folder: Path, meta: str = "one", settings: str = "fast") -> Path:
+    folder.mkdir(exist_ok=True)
+    (folder / "meta.json").write_text(meta)
+    (folder / "config.yaml").write_text(settings)
+    return folder
 
 
 def test_a_trial_s_folder_says_what_it_is_and_its_flags_leave_defaults_out(tmp_path, base):
@@ -149,11 +154,11 @@ def test_the_same_question_has_the_same_folder_wherever_its_base_lies(tmp_path, 
     asked = {"base": base, "iterations": 5, "penalty": 8.0}
     moved = base.rename(tmp_path / "moved")
     same = make_trial(tmp_path, {"penalty": 8.0, "iterations": 5, "method": "arft", "base": moved})
-    (tmp_path / "base").mkdir()
-    (tmp_path / "base" / "meta.json").write_text("one")
+    written(tmp_path / "base")
     assert make_trial(tmp_path, asked).folder == same.folder
     different = [{"penalty": 9.0}, {"iterations": 6}, {"seed": 1}, {"set": ["a=1"]}]
     folders = {make_trial(tmp_path, asked | change).folder for change in different}
-    (tmp_path / "base" / "meta.json").write_text("two")
-    folders |= {same.folder, make_trial(tmp_path, asked).folder}
-    assert len(folders) == 6
+    for meta, settings in (("two", "fast"), ("one", "slow")):
+        written(tmp_path / "base", meta, settings)
+        folders.add(make_trial(tmp_path, asked).folder)
+    assert len(folders | {same.folder}) == 7

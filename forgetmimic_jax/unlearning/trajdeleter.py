@@ -17,7 +17,7 @@ from forgetmimic_jax.ppo.loss import Batch, Prediction, mean, ppo_loss
 from forgetmimic_jax.tracking.reward import Reward
 from forgetmimic_jax.unlearning.method import Method, plain_reward
 
-BLOCK = 10  # iterations
+BLOCKS = 32  # of the forgetting phase, as many on what is kept as on the targets
 FORGETTING, DISTANCE = 0.8, 0.1
 
 
@@ -30,7 +30,8 @@ def in_two_phases(config: Config, batch: Batch, now: Prediction, iteration: Arra
     """The PPO loss on the steps of this block; in the second phase with the distance to the base's value."""
     assert batch.base is not None
     forgetting = iteration < FORGETTING * config.iterations
-    on_targets = forgetting & (iteration // BLOCK % 2 == 1)
+    block = max(1, round(FORGETTING * config.iterations / BLOCKS))
+    on_targets = forgetting & (iteration // block % 2 == 1)
     weight = jnp.where(on_targets, batch.is_target, ~batch.is_target)
     loss, metrics = ppo_loss(config, batch, now, weight=weight)
     distance = mean((now.value - batch.base.value) ** 2, weight)

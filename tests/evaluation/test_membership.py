@@ -44,7 +44,7 @@ def test_the_true_positive_rate_is_at_a_threshold_that_one_in_twenty_others_pass
     members = np.full((10, 3), 95.5)
     found = attack((members, others), (members, others))
     assert found.tpr_at_5_percent_fpr == 1.0
-    found = attack((members, others), (members - 1.0, others))
+    found = attack((members, others), (members - 2.0, others))
     assert found.tpr_at_5_percent_fpr == 0.0
 
 
