@@ -91,7 +91,8 @@ def measure(checkpoint_path: Path) -> dict:
         parts = (t.reward, t.value, t.next_value, t.terminated, t.truncated)
 
         def gradient(ahead: int, value: float):
-            advantage, _ = generalized_advantages(*(x[:ahead] for x in parts), ppo.discount, value)
+            near = jax.tree.map(operator.itemgetter(slice(ahead)), parts)
+            advantage, _ = generalized_advantages(*near, ppo.discount, value)
             advantage = centre_branches(advantage, done[:ahead], BRANCHES)[:USED]
 
             def surrogate(parameters):
@@ -107,7 +108,8 @@ def measure(checkpoint_path: Path) -> dict:
 
     state = runner.start_state(setup)
     rng = np.random.default_rng(0)
-    total, square, own, truth = 0.0, 0.0, 0.0, variants.index((STEPS, 1.0))
+    truth = variants.index((STEPS, 1.0))
+    total, square, own = np.zeros(1), np.zeros(1), np.zeros(1)
     within, between = [], []
     for batch in range(1 + BATCHES):
         state, gradients, first = one_batch(setup.assets, state)
