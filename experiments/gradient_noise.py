@@ -91,8 +91,8 @@ def measure(checkpoint_path: Path) -> dict:
         parts = (t.reward, t.value, t.next_value, t.terminated, t.truncated)
 
         def gradient(ahead: int, value: float):
-            near = jax.tree.map(operator.itemgetter(slice(ahead)), parts)
-            advantage, _ = generalized_advantages(*near, ppo.discount, value)
+            reward, values, following, terminated, truncated = (part[:ahead] for part in parts)
+            advantage, _ = generalized_advantages(reward, values, following, terminated, truncated, ppo.discount, value)
             advantage = centre_branches(advantage, done[:ahead], BRANCHES)[:USED]
 
             def surrogate(parameters):
