@@ -82,6 +82,7 @@ GOING_ON = {
     ),
     "longer": ("*long* after 4.1 M", "as *long*, `num_envs=256 num_steps=48 gae_lambda=0.97 learning_rate=4e-5`"),
 }
+LONG_ITERATIONS = {"long": 12_288, "longer": 12_288}  # environment steps; the other trials' have 4,096
 
 
 def going_on() -> str:
@@ -90,7 +91,7 @@ def going_on() -> str:
     for name, (start, settings) in GOING_ON.items():
         lines = (RESULTS / f"going_on_{name}.jsonl").read_text().splitlines()
         evaluations = [json.loads(line) for line in lines]
-        steps_per_iteration = 12_288 if "long" in name else 4096
+        steps_per_iteration = LONG_ITERATIONS.get(name, 4096)
         cells = [
             f"{row['iteration'] * steps_per_iteration / 1e6:.1f} M: {row['survival_weighted_tracking']:.2f} "
             f"({row['success_rate']:.0%})"
