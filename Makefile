@@ -55,6 +55,7 @@ sweep: .venv/.installed ## several unlearning runs that differ in one thing, wit
 experiments: .venv/.installed ## run what is missing of the paper's studies (hours), then write their pages
 	@status=0; for study in $(STUDIES); do \
 		.venv/bin/python -m experiments.$$study $(strip $(STUDY_FLAGS) $(ARGS)) || status=$$?; \
+		test $$status -lt 128 || break; \
 	done; exit $$status
 
 pretrain: .venv/.installed ## train a base policy on every clip

@@ -63,6 +63,7 @@ STUDY = Study(
     measure=measure,
     tell=tell,
     draw=lambda document: variant_bars(document["results"]["variants"]),
+    asks=[*METHODS, *ablation()],
 )
 
 if __name__ == "__main__":

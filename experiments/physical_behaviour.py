@@ -20,17 +20,21 @@ ERRORS = (
     *("anchor_position_error", "anchor_orientation_error", "max_key_body_position_error"),
     *("foot_contact", "joint_limit_violation"),
 )
+VARIANTS: dict[str, dict[str, Any]] = {
+    "fine-tuned": {"method": "finetune", "clips": "all"},
+    "λ = 8": {"penalty": 8.0},
+    "λ = 16": {"penalty": 16.0},
+}
 MEASURES = ("episode_length", *ERRORS)
 
 
 def measure(lab: Lab) -> dict[str, Any]:
-    """Base and unlearned policies on the same episodes of the targets; every episode's six numbers."""
-    penalties = {"λ = 8": {"penalty": 8.0}, "λ = 16": {"penalty": 16.0}}
+    """Every policy on the same episodes of the targets; every episode's six numbers."""
     runs = lab.run(
-        {(label, seed): {**variant, "seed": seed} for label, variant in penalties.items() for seed in lab.seeds},
+        {(label, seed): {**variant, "seed": seed} for label, variant in VARIANTS.items() for seed in lab.seeds},
         "physical behaviour",
     )
-    policies: dict[tuple[str, int], Path] = {("base", 0): lab.base}
+    policies: dict[tuple[str, int], Path | None] = {("base", 0): lab.base, ("zero action", 0): None}
     policies |= {key: newest_policy(folder) for key, folder in runs.items()}
     rollouts, names = lab.rollouts(policies)
     common = metrics.common_length(rollouts.values())

@@ -175,6 +175,7 @@ class Config:
     iterations: int = 100_000
     checkpoint_every: int = 500
     evaluate_every: int = 0  # iterations between evaluations during training; 0: none
+    evaluate_episodes: int = 6  # a clip in each of them: enough to see a trend, not to report
     max_episode_steps: int = 500  # 10 s
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
@@ -300,7 +301,7 @@ def to_dict(config: Any) -> dict[str, Any]:
 def config_hash(config: Config) -> str:
     """Content hash (16 hex digits) of every setting that changes a result."""
     content = to_dict(config)
-    for neutral in ("base", "checkpoint_every", "evaluate_every", "iterations"):
+    for neutral in ("base", "checkpoint_every", "evaluate_every", "evaluate_episodes", "iterations"):
         content.pop(neutral)
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 

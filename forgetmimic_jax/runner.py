@@ -38,7 +38,7 @@ from forgetmimic_jax.unlearning.registry import method_of
 COMPILATION_CACHE = DATA_DIR.parent / ".cache" / "jax"  # what XLA compiled is not compiled again at the next start
 BEST = "best"
 KEEP = 2  # newest checkpoints kept beside the named ones
-LOG_EVERY = 10  # iterations averaged into one row of metrics.jsonl
+LOG_EVERY = 10  # iterations averaged into one row of metrics.jsonl; the first has a row of its own
 
 
 @dataclass(frozen=True)
@@ -269,7 +269,7 @@ def run(
                 iteration += 1
                 environment_steps += steps_per_iteration
                 log.add(metrics)
-                if iteration % LOG_EVERY == 0:
+                if iteration == 1 or iteration % LOG_EVERY == 0:
                     log.write(iteration, environment_steps, setup.library.names)
                 report(iteration, environment_steps, _live(metrics))
                 if watch and iteration % config.evaluate_every == 0:

@@ -24,7 +24,7 @@ from forgetmimic_jax.errors import InputError, run_command
 from forgetmimic_jax.evaluation.plots import save
 from forgetmimic_jax.evaluation.variants import over_seeds, summary, variant_bars, variant_table
 from forgetmimic_jax.motion.clip import write_atomically
-from forgetmimic_jax.options import Settings, at_least, comma_separated, replace_given
+from forgetmimic_jax.options import Settings, at_least, comma_separated, override, replace_given
 from forgetmimic_jax.unlearn import ITERATIONS
 
 if TYPE_CHECKING:
@@ -121,7 +121,8 @@ class Lab:
     @property
     def control_iterations(self) -> int:
         """Of a policy that is trained from scratch: as many environment steps as the base's unless told otherwise."""
-        ppo = preset("paper").ppo if self.options.budget == "paper" else self.config.ppo
+        config = preset("paper") if self.options.budget == "paper" else self.config
+        ppo = override(config, itertools.chain(*self.options.set)).ppo
         steps = ppo.num_envs * ppo.num_steps
         return self.options.control_iterations or max(1, round(self.info.environment_steps / steps))
 
@@ -201,12 +202,12 @@ class Lab:
         return {"variants": result}
 
     def rollouts(
-        self, policies: Mapping[K, Path], clips: Sequence[Clip] | None = None
+        self, policies: Mapping[K, Path | None], clips: Sequence[Clip] | None = None
     ) -> tuple[dict[K, Rollout], tuple[str, ...]]:
         """Every policy on the same episodes, and the clips' names.
 
         Args:
-            policies: checkpoints by any key.
+            policies: checkpoints by any key; None is the zero action.
             clips: other clips than the library's.
         """
         from forgetmimic_jax import checkpoint, runner
@@ -221,7 +222,7 @@ class Lab:
         rolled = {}
         with progress("roll out", len(policies)) as report:
             for done, (key, path) in enumerate(policies.items(), start=1):
-                rolled[key] = evaluator.rollout(checkpoint.load_policy(path, shapes))
+                rolled[key] = evaluator.rollout(None if path is None else checkpoint.load_policy(path, shapes))
                 report(done, 0, {})
         return rolled, library.names
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from forgetmimic_jax.errors import InputError, run_command
-from forgetmimic_jax.evaluation import paper
+from forgetmimic_jax.evaluation import paper, statistics
 from forgetmimic_jax.evaluation.metrics import BASE
 from forgetmimic_jax.evaluation.plots import curve, heat_map, new_figure
 from forgetmimic_jax.evaluation.tables import FORGOTTEN, number
@@ -126,11 +127,39 @@ def _tell_lambda(variants: Mapping[str, Any]) -> str:
             "On the base's own target steps the mean reward changes its sign at λ_crit = W (1 + R_reg / R_track) = "
             f"{number(first['lambda_crit'], 2)}; W = 8 leaves the other rewards out.\n"
         )
+    seeds = _by_seed(variants)
+    crossed = [at for at in map(_half_gone, seeds.values()) if at]
+    if crossed:
+        lines.append(
+            f"Half of the base's skill on the targets is gone at λ = {number(statistics.over_seeds(crossed), 2)} "
+            f"({len(crossed)} of {len(seeds)} seeds; between two penalties, on a straight line in log λ). That is how "
+            "far this budget gets: a longer run may tip over earlier.\n"
+        )
     lines.append(
         f"At most {100 * FORGOTTEN:.0f} % of the base's skill on the targets is left at "
         f"{', '.join(forgotten) if forgotten else 'none of these penalties'}.\n"
     )
     return "\n".join(lines)
+
+
+def _by_seed(variants: Mapping[str, Any]) -> dict[str, dict[float, float]]:
+    """The share of the base's skill that is left on the targets, by seed and penalty."""
+    skills: dict[str, dict[float, float]] = {}
+    for variant in variants.values():
+        for seed, run in variant["seeds"].items():
+            if "skill" in run["policy"]["target"]:
+                skills.setdefault(seed, {})[float(variant["options"]["penalty"])] = run["policy"]["target"]["skill"]
+    return skills
+
+
+def _half_gone(skills: Mapping[float, float]) -> float | None:
+    """The penalty at which the skill, linear in log λ between the penalties tried, first falls to a half."""
+    tried = sorted(skills)
+    for low, high in itertools.pairwise(tried):
+        if skills[low] > 0.5 >= skills[high]:
+            share = (skills[low] - 0.5) / (skills[low] - skills[high])
+            return low * (high / low) ** share
+    return None
 
 
 def _draw_lambda(variants: Mapping[str, Any]) -> Figure:

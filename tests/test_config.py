@@ -93,7 +93,7 @@ def test_the_hash_sees_every_setting_that_changes_a_result():
     assert len(hashes) == 5
 
 
-@pytest.mark.parametrize("name", ["iterations", "checkpoint_every", "evaluate_every"])
+@pytest.mark.parametrize("name", ["iterations", "checkpoint_every", "evaluate_every", "evaluate_episodes"])
 def test_the_hash_does_not_see_how_long_or_how_often(name):
     assert config_hash(dataclasses.replace(Config(), **{name: 7})) == config_hash(Config())
 

@@ -83,11 +83,11 @@ def test_a_run_saves_logs_and_keeps_the_newest(run):
     assert path == run.folder / "checkpoints" / "00000040"
     assert state.iteration == 40
     assert names(run.folder) == ["00000030", "00000040"]
-    # A row ends every ten iterations and at every checkpoint, and holds the mean of its own: 11 to 15 is 13.
-    assert [row["iteration"] for row in rows(run.folder)] == [10, 15, 20, 30, 40]
-    assert [row["tracking_reward"] for row in rows(run.folder)] == [5.5, 13.0, 18.0, 25.5, 35.5]
-    assert [row["environment_steps"] for row in rows(run.folder)] == [n * 8 * 4 for n in (10, 15, 20, 30, 40)]
-    assert rows(run.folder)[1]["clips"]["turn"] == {
+    # A row ends after the first iteration, every ten and at every checkpoint, with the mean of its own: 2 to 10 is 6.
+    assert [row["iteration"] for row in rows(run.folder)] == [1, 10, 15, 20, 30, 40]
+    assert [row["tracking_reward"] for row in rows(run.folder)] == [1.0, 6.0, 13.0, 18.0, 25.5, 35.5]
+    assert [row["environment_steps"] for row in rows(run.folder)] == [n * 8 * 4 for n in (1, 10, 15, 20, 30, 40)]
+    assert rows(run.folder)[2]["clips"]["turn"] == {
         "success": 1.0,
         "survival_weighted_tracking": 1.0,
         "episode_length": 1.0,
@@ -108,7 +108,7 @@ def test_tensorboard_gets_the_same_numbers(run):
         data = data[16 + length :]
     scalars = {value.tag: value.simple_value for value in events[-1].summary.value}
     assert events[-1].step == 320
-    assert scalars["tracking_reward"] == 5.5
+    assert scalars["tracking_reward"] == 6.0
     assert scalars["turn/success"] == 1.0
 
 

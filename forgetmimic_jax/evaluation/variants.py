@@ -10,6 +10,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from forgetmimic_jax.evaluation import statistics
 from forgetmimic_jax.evaluation.metrics import BASE, ZERO_ACTION
 from forgetmimic_jax.evaluation.plots import bars, new_figure
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 METRICS = ("success_rate", "survival_weighted_tracking", "tracking_reward", "episode_length", "skill", "retention")
+EPISODES = "episodes"  # of the group, behind its success rate
 RATIOS = ("degradation_ratio", "survival_weighted_degradation_ratio")
 
 
@@ -29,6 +32,7 @@ NOTES = (
     "over the steps before it.",
     "skill left: share of the base's skill above the zero action; ratio: target over kept, of tracking while alive "
     "(the paper's) and of tracking.",
+    "a success rate that is the same with every seed has the exact interval of all episodes together.",
     "Rows of the paper: another library of clips, another base and another budget.",
 )
 
@@ -36,18 +40,24 @@ NOTES = (
 def summary(folder: Path) -> dict[str, Any]:
     """The means of a finished trial's evaluation: {"base", "policy", "zero_action": {"target", "kept", "clips", ...}}.
 
-    With `lambda_crit`: the threshold on target steps in the first logged iterations, when the policy still is the base.
+    With `lambda_crit`, the threshold on target steps in the first iteration, whose steps are the base's own, and
+    `target_step_share`, how much of the training was spent on the targets.
     """
     document = json.loads((folder / "evaluation.json").read_text())
     result: dict[str, Any] = {}
     for name, policy in document["policies"].items():
         groups = {group: _means(policy[group]) for group in ("target", "kept") if group in policy}
         clips = {clip: _means(metrics) for clip, metrics in policy["clips"].items()}
+        for of in groups:
+            groups[of][EPISODES] = policy[of]["success_rate"]["n"]
         ratios = {ratio: policy[ratio]["mean"] for ratio in RATIOS if "mean" in policy.get(ratio, {})}
         result[name if name in (BASE, ZERO_ACTION) else "policy"] = {**groups, "clips": clips, **ratios}
     rows = read_rows(folder / "metrics.jsonl")
     if rows and "target/lambda_crit" in rows[0]:
         result["lambda_crit"] = rows[0]["target/lambda_crit"]
+    if rows and "target/step_share" in rows[0]:
+        lived = np.diff([0, *(row["environment_steps"] for row in rows)])
+        result["target_step_share"] = float(np.average([row["target/step_share"] for row in rows], weights=lived))
     return result
 
 
@@ -56,11 +66,20 @@ def _means(metrics: Mapping[str, Any]) -> dict[str, float]:
 
 
 def over_seeds(runs: Sequence[Any]) -> Any:
-    """Nested numbers, one tree a seed, as one tree of estimates; a number that only some seeds have is over those."""
+    """Nested numbers, one tree a seed, as one tree of estimates; a number that only some seeds have is over those.
+
+    A success rate that is the same with every seed gets the exact interval of their episodes together.
+    """
     if not isinstance(runs[0], Mapping):
         return statistics.over_seeds(runs)
     names = dict.fromkeys(name for run in runs for name in run)
-    return {name: over_seeds([run[name] for run in runs if name in run]) for name in names}
+    result = {name: over_seeds([run[name] for run in runs if name in run]) for name in names}
+    if EPISODES in result and result["success_rate"].get("std", 1.0) < 1e-9:
+        # Seeds that all fail have no spread to learn from: the exact interval of all episodes together.
+        episodes = sum(run[EPISODES] for run in runs)
+        pooled = statistics.rate(round(result["success_rate"]["mean"] * episodes), episodes)
+        result["success_rate"] |= {end: pooled[end] for end in ("low", "high")}
+    return result
 
 
 def variant_table(variants: Mapping[str, Any], theirs: Mapping[str, Any]) -> str:

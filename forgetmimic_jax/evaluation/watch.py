@@ -16,7 +16,6 @@ from forgetmimic_jax.rows import drop_rows_after, read_rows
 from forgetmimic_jax.state import Policy
 
 FILE = "evaluations.jsonl"
-EPISODES = 6  # a clip: enough to see a trend, not to report
 SHOWN = ("success_rate", "survival_weighted_tracking", "tracking_reward")
 
 
@@ -24,7 +23,7 @@ class Watch:
     """Evaluates a run's policy on the same few episodes each time: a row of evaluations.jsonl, and its PNG."""
 
     def __init__(self, config: Config, robot: Robot, library: MotionLibrary, directory: Path, iteration: int):
-        self._evaluator = Evaluator(config, robot, library, episodes=EPISODES, seed=config.seed)
+        self._evaluator = Evaluator(config, robot, library, episodes=config.evaluate_episodes, seed=config.seed)
         self._names = library.names
         self._path = directory / FILE
         rows = drop_rows_after(self._path, iteration)

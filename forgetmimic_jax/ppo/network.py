@@ -116,13 +116,19 @@ def normalize(normalizer: Normalizer, observation: Array) -> Array:
 
 
 def update_normalizer(normalizer: Normalizer, observation: Array, max_count: float = 1e8) -> Normalizer:
-    """Merge a batch [..., features]. Past `max_count` the statistics forget slowly instead of freezing."""
+    """Merge a batch [..., features]. Past `max_count` the statistics forget slowly instead of freezing.
+
+    A feature that never varied, such as the wrench of a training without one, starts anew when it first does.
+    """
     flat = observation.reshape(-1, observation.shape[-1])
     count = jnp.float32(flat.shape[0])
     mean, variance = flat.mean(0), flat.var(0)
-    total = normalizer.count + count
+    before = jnp.where(normalizer.variance > 0.0, normalizer.count, 0.0)
+    total = before + count
     shift = mean - normalizer.mean
-    merged = normalizer.variance * normalizer.count + variance * count + shift**2 * normalizer.count * count / total
+    merged = normalizer.variance * before + variance * count + shift**2 * before * count / total
     return Normalizer(
-        mean=normalizer.mean + shift * count / total, variance=merged / total, count=jnp.minimum(total, max_count)
+        mean=normalizer.mean + shift * count / total,
+        variance=merged / total,
+        count=jnp.minimum(normalizer.count + count, max_count),
     )

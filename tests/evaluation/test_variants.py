@@ -20,6 +20,17 @@ def test_one_seed_has_no_interval_and_a_number_that_some_lack_is_over_the_others
     assert found == {"skill": {"mean": 0.5, "n": 1}}
 
 
+def test_seeds_that_all_fail_have_the_exact_interval_of_their_episodes_together():
+    runs = [{"success_rate": 0.0, "episodes": 40, "skill": 0.1}] * 3
+    found = over_seeds(runs)["success_rate"]
+    exact = stats.binomtest(0, 120).proportion_ci(method="exact")
+    assert (found["low"], found["high"], found["n"]) == pytest.approx((0.0, exact.high, 3))
+    some = over_seeds([*runs[:2], {**runs[0], "success_rate": 0.3}])["success_rate"]
+    low, high = stats.t.interval(0.95, 2, loc=0.1, scale=stats.sem([0.0, 0.0, 0.3]))
+    assert (some["low"], some["high"]) == pytest.approx((low, high))
+    assert "low" not in over_seeds(runs[:1])["success_rate"]
+
+
 def estimates(success: float, tracking: float) -> dict:
     return over_seeds(
         [{"success_rate": value, "survival_weighted_tracking": tracking} for value in (success - 0.1, success + 0.1)]

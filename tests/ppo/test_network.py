@@ -108,6 +108,18 @@ def test_normalizer_has_the_statistics_of_all_batches_together():
     assert float(normalizer.count) == len(together)
 
 
+def test_a_feature_that_never_varied_starts_anew_when_it_first_does():
+    rng = np.random.default_rng(4)
+    before, after = rng.normal(2.0, 3.0, (1000, 2)), rng.normal(5.0, 0.1, (50, 2))
+    before[:, 1] = 0.0
+    normalizer = init_normalizer(2)
+    for batch in (before, before, after):
+        normalizer = update_normalizer(normalizer, jnp.asarray(batch, jnp.float32))
+    together = np.concatenate([before, before, after])
+    np.testing.assert_allclose(normalizer.mean, [together[:, 0].mean(), after[:, 1].mean()], rtol=1e-5)
+    np.testing.assert_allclose(normalizer.variance, [together[:, 0].var(), after[:, 1].var()], rtol=1e-3)
+
+
 def test_normalized_observations_have_mean_zero_and_variance_one():
     observation = jnp.asarray(np.random.default_rng(2).normal(5.0, 3.0, (1000, 2)), jnp.float32)
     scaled = normalize(update_normalizer(init_normalizer(2), observation), observation)
