@@ -30,7 +30,7 @@ class Options:
     clips: str | None = None
     """Clips to film, comma-separated; all of the library by default."""
     seconds: float = 10.0
-    """Longest film, s; a film ends sooner where the clip does, or once every policy has fallen."""
+    """Longest film, s; a film ends sooner where the clip does, or once every policy has lost the motion."""
     stills: int = 6
     """Pictures of each clip on the page of stills, from its start to its end."""
     seed: int = 0
@@ -103,8 +103,8 @@ def _table(episodes: Sequence[Episode], targets: Sequence[str]):
     for episode in episodes:
         cells = []
         for take in episode.takes.values():
-            fell = "" if take.ended is None else f", fell at {take.ended / episode.fps:.2f} s"
-            cells.append(f"{take.survival_weighted_tracking:.2f}{fell}")
+            lost = "" if take.ended is None else f", lost the motion at {take.ended / episode.fps:.2f} s"
+            cells.append(f"{take.survival_weighted_tracking:.2f}{lost}")
         table.add_row(episode.clip, "target" if episode.clip in targets else "kept", *cells)
     return table
 

@@ -149,7 +149,7 @@ def _pane(
     pen.rectangle([0, 0, width - 1, height - 1], outline=PAPER)
     if ended is not None:
         pen.rectangle([0, 0, width - 1, height - 1], outline=RED, width=BORDER)
-        _chip(pen, (width - 10, 10), f"fell at {ended / episode.fps:.2f} s", RED, right=True)
+        _chip(pen, (width - 10, 10), f"lost the motion at {ended / episode.fps:.2f} s", RED, right=True)
     return image
 
 

@@ -107,9 +107,9 @@ class Page:
         reference = self._poses(playback.reference)
         with self._server.atomic():
             for lane, qpos, ended in zip(self._lanes, playback.qpos, playback.ended, strict=True):
-                fell = None if ended is None else ended * playback.control_step
+                lost = None if ended is None else ended * playback.control_step
                 shown = reference if self._ghost.value else None
-                lane.show(qpos, self._poses(qpos), shown, playback.reference, heading, fell)
+                lane.show(qpos, self._poses(qpos), shown, playback.reference, heading, lost)
             if plots:
                 self._show_plots()
         self._server.flush()
@@ -186,13 +186,13 @@ class Page:
         playback = self._playback
         now = playback.step * playback.control_step
         lines = [
-            f"{now:.2f} of {playback.horizon * playback.control_step:.2f} s. Mean tracking reward, 0 after a fall:"
+            f"{now:.2f} of {playback.horizon * playback.control_step:.2f} s. Mean tracking reward, 0 once it is lost:"
         ]
         tracking = np.array(playback.tracking).reshape(-1, len(self._policies))
         for policy, ended in enumerate(playback.ended):
             mean = f"{tracking[:, policy].mean():.2f}" if playback.step else "–"
-            fell = "" if ended is None else f", fell at {ended * playback.control_step:.2f} s"
-            lines.append(f"- {self._policies[policy]}: **{mean}**{fell}")
+            lost = "" if ended is None else f", lost the motion at {ended * playback.control_step:.2f} s"
+            lines.append(f"- {self._policies[policy]}: **{mean}**{lost}")
         self._status.content = "\n".join(lines)
         times = np.arange(playback.step + 1) * playback.control_step
         if playback.step:
@@ -238,7 +238,7 @@ class _Lane:
         ghost: tuple[np.ndarray, np.ndarray] | None,
         reference: np.ndarray,
         heading: float,
-        fell: float | None,
+        lost: float | None,
     ) -> None:
         """Move everything.
 
@@ -248,7 +248,7 @@ class _Lane:
             ghost: those of the reference; None: not to be seen.
             reference: [nq] of the reference.
             heading: yaw that is turned towards the viewer, rad.
-            fell: when the episode ended, s; None: it has not.
+            lost: when the episode ended, s; None: it has not.
         """
         turn = Rotation.from_euler("z", -heading)
         centre = turn.apply([*qpos[:2], 0.0])
@@ -261,8 +261,8 @@ class _Lane:
         self._ghost.visible(near)
         if near and ghost is not None:
             self._ghost.show(ghost)
-        self._alarm.visible = fell is not None
-        self._label.text = self._name if fell is None else f"{self._name}: fell at {fell:.2f} s"
+        self._alarm.visible = lost is not None
+        self._label.text = self._name if lost is None else f"{self._name}: lost the motion at {lost:.2f} s"
 
 
 class _Figure:

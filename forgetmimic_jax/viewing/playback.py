@@ -62,8 +62,8 @@ class Playback:
     def done(self) -> bool:
         """The clip is over, or every policy's episode has been for a while."""
         ends = [ended for ended in self.ended if ended is not None]
-        fallen = len(ends) == len(self.ended) and self.step >= max(ends) + AFTER_END_SECONDS / self.control_step
-        return self.step >= self.horizon or fallen
+        all_lost = len(ends) == len(self.ended) and self.step >= max(ends) + AFTER_END_SECONDS / self.control_step
+        return self.step >= self.horizon or all_lost
 
     def _heights(self) -> np.ndarray:
         return np.append(self.qpos[:, 2], self.reference[2])

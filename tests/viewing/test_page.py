@@ -115,8 +115,8 @@ def test_an_end_shows_as_a_red_frame_and_in_words(page):
     playback.ended = [None, 1]
     page._show(plots=True)
     assert [lane._alarm.visible for lane in page._lanes] == [False, True]
-    assert [lane._label.text for lane in page._lanes] == ["base", "unlearned: fell at 0.02 s"]
-    assert page._status.content.splitlines()[1:] == ["- base: **0.70**", "- unlearned: **0.40**, fell at 0.02 s"]
+    assert [lane._label.text for lane in page._lanes] == ["base", "unlearned: lost the motion at 0.02 s"]
+    assert page._status.content.splitlines()[1:] == ["- base: **0.70**", "- unlearned: **0.40**, lost the motion at 0.02 s"]
 
 
 def test_a_robot_stays_in_the_middle_of_its_floor_facing_the_viewer(page):

@@ -44,7 +44,7 @@ def test_it_stops_at_the_clips_end_and_begins_again_where_it_began(playback):
     assert (playback.clip, playback.horizon) == (0, 79)
 
 
-def test_it_is_done_a_while_after_the_last_policy_fell(playback):
+def test_it_is_done_a_while_after_every_policy_lost_the_motion(playback):
     playback.horizon = 1000
     playback.ended = [4, 30]
     after = round(AFTER_END_SECONDS / playback.control_step)
