@@ -38,9 +38,9 @@ def measure(lab: Lab) -> dict[str, Any]:
     base = _on_targets(json.loads(next(iter(folders.values())).joinpath("evaluation.json").read_text()), lab.targets)
     every = max(1, lab.iterations // EVALUATIONS)
     # A start's own settings would be its training's: all of them relearn at the same fixed pace.
-    alike = ["ppo.schedule=fixed", f"ppo.learning_rate={PACE['learning_rate']}", "ppo.clip_value=false"]
-    alike += ["wrench.max_gain=0.0"]
-    measured = [f"evaluate_every={every}", f"evaluate_episodes={lab.options.episodes}"]
+    pace = {**PACE, "schedule": "fixed"} if lab.options.budget == "cpu" else {}
+    alike = [f"ppo.{name}={json.dumps(value)}" for name, value in pace.items()] + ["wrench.max_gain=0.0"]
+    measured = [f"evaluate_every={every}", f"evaluate_episodes={max(1, lab.options.episodes // 2)}"]
     watched = {"clips": "all", "set": [*measured, *alike]}
     relearn: dict[tuple[str, int], dict[str, Any]] = {
         (label, seed): {**watched, "method": "finetune", "base": newest_policy(folder), "seed": seed}

@@ -137,7 +137,7 @@ class PPOConfig:
     epochs: int = 5
     minibatches: int = 4
     learning_rate: float = 1e-3
-    # The step size follows the KL at every minibatch or iteration, stays, or falls to its minimum over the run.
+    # The step size follows the KL at every minibatch or iteration, stays, or falls in the second half of the run.
     schedule: Literal["adaptive", "adaptive_iteration", "fixed", "linear"] = "adaptive"
     target_kl: float = 0.01
     min_learning_rate: float = 1e-5

@@ -88,6 +88,6 @@ def adapt_learning_rate(
 
 
 def anneal_learning_rate(config: PPOConfig, progress: Array) -> Array:
-    """From `learning_rate` linearly down to `min_learning_rate` [] as progress [] through the run goes from 0 to 1."""
-    left = jnp.maximum(1.0 - progress, 0.0)
+    """`learning_rate` until half of the run, then linearly down to `min_learning_rate` [] as progress [] goes to 1."""
+    left = jnp.clip(2.0 * (1.0 - progress), 0.0, 1.0)
     return config.min_learning_rate + left * (config.learning_rate - config.min_learning_rate)

@@ -287,8 +287,9 @@ def test_the_linear_schedule_is_where_the_run_is(problem):
     ppo = dataclasses.replace(env.config.ppo, schedule="linear", learning_rate=1e-3, min_learning_rate=0.0)
     config = dataclasses.replace(env.config, iterations=10, ppo=ppo)
     run = SimpleNamespace(config=config, robot=env.robot, assets=env.assets)
-    after, _ = improved(run, dataclasses.replace(state, iteration=jnp.int32(6)), batch, advantage, target)
-    assert float(after.learning_rate) == pytest.approx(3e-4)
+    for iteration, learning_rate in ((3, 1e-3), (6, 6e-4), (9, 0.0)):
+        after, _ = improved(run, dataclasses.replace(state, iteration=jnp.int32(iteration)), batch, advantage, target)
+        assert float(after.learning_rate) == pytest.approx(learning_rate)
 
 
 def test_ended_episodes_and_steps_are_counted_clip_by_clip(run):

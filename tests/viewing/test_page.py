@@ -116,7 +116,10 @@ def test_an_end_shows_as_a_red_frame_and_in_words(page):
     page._show(plots=True)
     assert [lane._alarm.visible for lane in page._lanes] == [False, True]
     assert [lane._label.text for lane in page._lanes] == ["base", "unlearned: lost the motion at 0.02 s"]
-    assert page._status.content.splitlines()[1:] == ["- base: **0.70**", "- unlearned: **0.40**, lost the motion at 0.02 s"]
+    assert page._status.content.splitlines()[1:] == [
+        "- base: **0.70**",
+        "- unlearned: **0.40**, lost the motion at 0.02 s",
+    ]
 
 
 def test_a_robot_stays_in_the_middle_of_its_floor_facing_the_viewer(page):
