@@ -56,7 +56,7 @@ experiments: .venv/.installed ## run what is missing of the paper's studies (hou
 	@status=0; for study in $(STUDIES); do \
 		.venv/bin/python -m experiments.$$study $(strip $(STUDY_FLAGS) $(ARGS)) || status=$$?; \
 		test $$status -lt 128 || break; \
-	done; exit $$status
+	done; .venv/bin/python -m experiments.claims; exit $$status
 
 pretrain: .venv/.installed ## train a base policy on every clip
 	$(MODULE).train $(strip $(TRAIN_FLAGS) $(ARGS))
@@ -91,6 +91,7 @@ tables: .venv/.installed ## rewrite the README's tables and the studies' pages f
 	@for study in $(STUDIES); do \
 		test ! -f experiments/results/$$study.json || .venv/bin/python -m experiments.$$study --draw || exit; \
 	done
+	.venv/bin/python -m experiments.claims
 
 test: .venv/.installed ## run the tests
 	.venv/bin/python -m pytest $(ARGS)

@@ -127,8 +127,8 @@ def _tell_lambda(variants: Mapping[str, Any]) -> str:
             "On the base's own target steps the mean reward changes its sign at λ_crit = W (1 + R_reg / R_track) = "
             f"{number(first['lambda_crit'], 2)}; W = 8 leaves the other rewards out.\n"
         )
-    seeds = _by_seed(variants)
-    crossed = [at for at in map(_half_gone, seeds.values()) if at]
+    seeds = skill_by_seed(variants)
+    crossed = [at for at in map(half_gone, seeds.values()) if at]
     if crossed:
         lines.append(
             f"Half of the base's skill on the targets is gone at λ = {number(statistics.over_seeds(crossed), 2)} "
@@ -142,7 +142,7 @@ def _tell_lambda(variants: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _by_seed(variants: Mapping[str, Any]) -> dict[str, dict[float, float]]:
+def skill_by_seed(variants: Mapping[str, Any]) -> dict[str, dict[float, float]]:
     """The share of the base's skill that is left on the targets, by seed and penalty."""
     skills: dict[str, dict[float, float]] = {}
     for variant in variants.values():
@@ -152,7 +152,7 @@ def _by_seed(variants: Mapping[str, Any]) -> dict[str, dict[float, float]]:
     return skills
 
 
-def _half_gone(skills: Mapping[float, float]) -> float | None:
+def half_gone(skills: Mapping[float, float]) -> float | None:
     """The penalty at which the skill, linear in log λ between the penalties tried, first falls to a half."""
     tried = sorted(skills)
     for low, high in itertools.pairwise(tried):

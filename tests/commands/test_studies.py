@@ -265,5 +265,5 @@ def test_a_level_is_reached_at_the_first_of_two_evaluations_in_a_row():
 
 
 def test_the_penalty_where_half_of_the_skill_is_gone_lies_between_two_that_were_tried():
-    assert sweep._half_gone({16.0: 0.1, 4.0: 0.9, 8.0: 0.7}) == pytest.approx(8.0 * 2.0 ** (0.2 / 0.6))
-    assert sweep._half_gone({4.0: 0.9, 16.0: 0.6}) is None
+    assert sweep.half_gone({16.0: 0.1, 4.0: 0.9, 8.0: 0.7}) == pytest.approx(8.0 * 2.0 ** (0.2 / 0.6))
+    assert sweep.half_gone({4.0: 0.9, 16.0: 0.6}) is None

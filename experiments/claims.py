@@ -1,0 +1,230 @@
+"""The paper's claims, one by one, against the numbers of our studies: `python -m experiments.claims`.
+
+Fills the block of `experiments/README.md` from the studies' JSON alone. A claim is a number and a bound: it holds where
+the number's whole 95 % interval over the seeds lies on the right side, does not hold where it lies on the wrong side,
+and is open between. With one seed there is no interval, and the word is only which way it points.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments import comparison, membership, relearning
+from forgetmimic_jax.errors import InputError, run_command
+from forgetmimic_jax.evaluation import statistics
+from forgetmimic_jax.evaluation.statistics import Estimate
+from forgetmimic_jax.evaluation.tables import FORGOTTEN, markdown_table, number, percent
+from forgetmimic_jax.evaluation.variants import over_seeds
+from forgetmimic_jax.motion.clip import write_atomically
+from forgetmimic_jax.study import RESULTS
+from forgetmimic_jax.sweep import half_gone, skill_by_seed
+
+README = Path(__file__).parent / "README.md"
+BLOCK = re.compile(r"(<!-- claims:start -->\n).*?(<!-- claims:end -->)", re.DOTALL)
+
+SUCCESS, TRACKING = "success_rate", "survival_weighted_tracking"
+NONE = 0.05  # of episodes: a success rate below it counts as none
+POINTS = 0.05  # of success that kept clips may lose
+SOONER = 1.0  # steps by which an episode may end before doing nothing would end it
+ARFT = "arft, uniform clips"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a study says of a claim: a row of the table."""
+
+    claim: str
+    verdict: str
+    evidence: str
+
+
+def judged(value: Estimate, bound: float, *, below: bool = True) -> str:
+    """Whether a number lies below (or above) its bound."""
+    mean = value["mean"]
+    if "low" not in value:
+        return "one seed: yes" if (mean <= bound) == below else "one seed: no"
+    low, high = value["low"], value["high"]
+    if (high <= bound) if below else (low >= bound):
+        return "holds"
+    return "does not hold" if ((low > bound) if below else (high < bound)) else "open"
+
+
+def gained(variants: Mapping[str, Any], label: str, other: str | None, group: str, metric: str) -> Estimate | None:
+    """A variant's number less another's of the same seed, or less the base's; None where no seed has both."""
+    if label not in variants or (other and other not in variants):
+        return None
+    mine = variants[label]["seeds"]
+    theirs = {seed: run["policy"] for seed, run in variants[other]["seeds"].items()} if other else {
+        seed: run["base"] for seed, run in mine.items()
+    }  # fmt: skip
+    both = [seed for seed in mine if seed in theirs]
+    pairs = [(mine[seed]["policy"][group][metric], theirs[seed][group][metric]) for seed in both]
+    return statistics.over_seeds([a - b for a, b in pairs]) if pairs else None
+
+
+def of_validity(document: Mapping[str, Any]) -> Iterator[Finding]:
+    """Fig. 2: forgotten and kept."""
+    variants = document["results"]["variants"]
+    for label, variant in variants.items():
+        success = over_seeds([run["policy"]["target"] for run in variant["seeds"].values()])[SUCCESS]
+        claim = f"{label}: the targets no longer succeed"
+        yield Finding(claim, judged(success, NONE), f"target success {percent(success)}; at most {NONE:.0%} asked")
+        skill = variant["over_seeds"]["policy"]["target"].get("skill")
+        if skill:
+            evidence = f"{percent(skill)} of the skill above the zero action is left; at most {FORGOTTEN:.0%} asked"
+            yield Finding(f"{label}: the skill is gone", judged(skill, FORGOTTEN), evidence)
+        yield from _kept(variants, label, None, f"{label}: the kept clips stay as they were")
+
+
+def of_comparison(document: Mapping[str, Any]) -> Iterator[Finding]:
+    """Table 1: against the control, the other methods, and the ablation."""
+    variants = document["results"]["variants"]
+    claim = "λ = 16: the kept clips are what fine-tuning without an anti-reward gives"
+    yield from _kept(variants, ARFT, comparison.CONTROL, claim)
+    for method in ("random reward", "decremental", "trajdeleter"):
+        kept = gained(variants, method, ARFT, "kept", TRACKING)
+        if kept:
+            evidence = f"kept tracking {number(kept, 2)} on λ = 16's"
+            yield Finding(f"{method} hurts the kept clips more", judged(kept, 0.0), evidence)
+    for method in ("random reward", "trajdeleter"):
+        target = gained(variants, method, ARFT, "target", TRACKING)
+        if target:
+            evidence = f"target tracking {number(target, 2)} on λ = 16's"
+            yield Finding(f"{method} forgets less", judged(target, 0.0, below=False), evidence)
+    for label, name in (("arft, adaptive", "adaptive RSI"), ("arft, uniform clips, wrench", "the wrench")):
+        for group, claim in (("target", f"{name} resists forgetting"), ("kept", f"{name} costs the kept clips")):
+            change = gained(variants, label, ARFT, group, TRACKING)
+            if change:
+                verdict = judged(change, 0.0, below=group == "kept")
+                yield Finding(claim, verdict, f"{group} tracking {number(change, 2)} on λ = 16's without it")
+
+
+def of_penalty(document: Mapping[str, Any]) -> Iterator[Finding]:
+    """Table 2: where the targets tip over."""
+    variants = document["results"]["variants"]
+    crossed = [penalty for penalty in map(half_gone, skill_by_seed(variants).values()) if penalty]
+    if crossed:
+        found = statistics.over_seeds(crossed)
+        crit = next(iter(variants.values()))["over_seeds"].get("lambda_crit")
+        evidence = f"half of the skill is gone at λ = {number(found, 1)}; λ_crit on the base's steps {number(crit, 2)}"
+        yield Finding("forgetting sets in below λ = 8 = W", judged(found, 8.0), evidence)
+
+
+def of_heat_map(document: Mapping[str, Any]) -> Iterator[Finding]:
+    """Fig. 3: wear."""
+    groups, bound = document["results"]["groups"], 0.95
+    start, end = groups[0]["kept"][TRACKING], groups[-1]["kept"][TRACKING]
+    evidence = f"kept tracking {number(start, 2)} at the start, {number(end, 2)} at the end; {bound:.0%} of it asked"
+    yield Finding(
+        "a long run does not wear the kept clips down", judged(end, bound * start["mean"], below=False), evidence
+    )
+
+
+def of_motion_types(document: Mapping[str, Any]) -> Iterator[Finding]:
+    """Fig. 4: any motion."""
+    for label, variant in document["results"]["variants"].items():
+        skill = variant["over_seeds"]["policy"]["target"].get("skill")
+        if skill:
+            evidence = f"{percent(skill)} of the skill is left"
+            yield Finding(f"{label} can be forgotten", judged(skill, FORGOTTEN), evidence)
+
+
+def of_physical_behaviour(document: Mapping[str, Any]) -> Iterator[Finding]:
+    """Fig. 6: forgotten, or sabotaged?"""
+    policies = document["results"]["policies"]
+    length = {label: [np.mean(run["episode_length"]) for run in runs.values()] for label, runs in policies.items()}
+    floor = float(np.mean(length["zero action"]))
+    for label in ("λ = 8", "λ = 16"):
+        if label in length:
+            found = statistics.over_seeds(length[label])
+            evidence = f"target episodes last {number(found, 1)} steps, {floor:.1f} without a policy"
+            claim = f"{label}: short episodes mean a lost skill, and not an episode ended on purpose"
+            yield Finding(claim, judged(found, floor - SOONER, below=False), evidence)
+
+
+def of_relearning(document: Mapping[str, Any]) -> Iterator[Finding]:
+    """Fig. 8, with the control that the paper lacks."""
+    base, starts = document["results"]["base"], document["results"]["starts"]
+    if not {"unlearned", "retrained"} <= starts.keys():
+        return
+    for share in relearning.SHARES:
+        steps = {}
+        for label in ("unlearned", "retrained"):
+            curves = starts[label].values()
+            found = [relearning.crossing(curve, share * base) for curve in curves]
+            steps[label] = [pair[1] if pair else None for pair in found]
+        mine = [step for step in steps["unlearned"] if step is not None]
+        theirs = [step for step in steps["retrained"] if step is not None]
+        claim = f"{share:.0%} of the tracking comes back no sooner than it comes to a policy that never had it"
+        if not mine or not theirs:
+            never = " and ".join(label for label, of in (("unlearned", mine), ("retrained", theirs)) if not of)
+            yield Finding(claim, "open" if not mine else "does not hold", f"not reached within the run: {never}")
+            continue
+        found_mine, mean = statistics.over_seeds(mine), float(np.mean(theirs))
+        evidence = f"{number(found_mine, 0)} target steps from the unlearned policy, {mean:,.0f} from the retrained"
+        yield Finding(claim, judged(found_mine, mean, below=False), evidence)
+
+
+def of_membership(document: Mapping[str, Any]) -> Iterator[Finding]:
+    """Appendix: the attack."""
+    for label, of in document["results"]["policies"].items():
+        claim = f"{label}: membership of the targets cannot be told"
+        yield Finding(claim, membership.verdict(of["auc"]), f"AUC {number(of['auc'], 2)}; 0.5 is guessing")
+
+
+JUDGES: dict[str, Callable[[Mapping[str, Any]], Iterator[Finding]]] = {
+    "validity": of_validity,
+    "comparison": of_comparison,
+    "penalty": of_penalty,
+    "heat_map": of_heat_map,
+    "motion_types": of_motion_types,
+    "physical_behaviour": of_physical_behaviour,
+    "relearning": of_relearning,
+    "membership": of_membership,
+}
+
+
+def _kept(variants: Mapping[str, Any], label: str, other: str | None, claim: str) -> Iterator[Finding]:
+    change = gained(variants, label, other, "kept", SUCCESS)
+    if change:
+        whose = "the control's" if other else "the base's"
+        evidence = f"kept success {percent(change)} on {whose}; at most {POINTS:.0%} lost asked"
+        yield Finding(claim, judged(change, -POINTS, below=False), evidence)
+
+
+def table(folder: Path = RESULTS, judges: Mapping[str, Callable] = JUDGES) -> str:
+    """Every claim whose study has been measured, and which have not been."""
+    rows: list[Sequence[str]] = []
+    missing = []
+    for study, judge in judges.items():
+        path = folder / f"{study}.json"
+        if not path.is_file():
+            missing.append(study)
+            continue
+        document = json.loads(path.read_text())
+        seeds = document["asked"]["seeds"]
+        rows += [
+            [f"[{study}](results/{study}.md)", of.claim, f"**{of.verdict}**", of.evidence, str(seeds)]
+            for of in judge(document)
+        ]
+    text = markdown_table(["study", "claim", "here", "evidence", "seeds"], rows) if rows else ""
+    return f"{text}\nNot measured yet: {', '.join(missing)}.\n" if missing else text
+
+
+def main() -> None:
+    """Write the table into its block."""
+    text = README.read_text()
+    if not BLOCK.search(text):
+        raise InputError(f"{README}: no block '<!-- claims:start -->' ... '<!-- claims:end -->' to fill")
+    write_atomically(README, BLOCK.sub(lambda block: f"{block[1]}{table()}{block[2]}", text).encode())
+
+
+if __name__ == "__main__":
+    run_command(main)

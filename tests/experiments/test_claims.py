@@ -1,0 +1,107 @@
+import json
+
+import pytest
+
+from experiments import claims
+from forgetmimic_jax.evaluation.statistics import over_seeds
+
+
+@pytest.mark.parametrize(
+    ("values", "below", "verdict"),
+    [
+        ([0.01, 0.02, 0.015], True, "holds"),
+        ([0.01, 0.02, 0.015], False, "does not hold"),
+        ([0.5, 0.52, 0.51], True, "does not hold"),
+        ([0.0, 0.1, 0.05], True, "open"),
+        ([0.0, 0.1, 0.05], False, "open"),
+        ([0.04], True, "one seed: yes"),
+        ([0.04], False, "one seed: no"),
+    ],
+)
+def test_a_claim_holds_where_the_whole_interval_does(values, below, verdict):
+    assert claims.judged(over_seeds(values), 0.05, below=below) == verdict
+
+
+def variant(target: list[float], kept: list[float], base: float = 0.6) -> dict:
+    """As the comparison's JSON has it, a seed each."""
+
+    def group(value: float) -> dict:
+        return {"success_rate": value, "survival_weighted_tracking": value}
+
+    seeds = {
+        str(seed): {
+            "policy": {"target": group(a), "kept": group(b)},
+            "base": {"target": group(0.8), "kept": group(base)},
+        }
+        for seed, (a, b) in enumerate(zip(target, kept, strict=True))
+    }
+    return {"seeds": seeds}
+
+
+def test_differences_are_between_runs_of_the_same_seed():
+    variants = {"a": variant([0.0, 0.1], [0.5, 0.7]), "b": variant([0.1], [0.45])}
+    assert claims.gained(variants, "a", None, "kept", "success_rate")["mean"] == pytest.approx(0.0)
+    only = claims.gained(variants, "a", "b", "kept", "success_rate")
+    assert only == {"mean": pytest.approx(0.05), "n": 1}
+    assert claims.gained(variants, "a", "c", "kept", "success_rate") is None
+
+
+def test_the_comparisons_claims_by_hand():
+    variants = {
+        claims.ARFT: variant([0.1, 0.1, 0.1], [0.59, 0.60, 0.61]),
+        claims.comparison.CONTROL: variant([0.8, 0.8, 0.8], [0.60, 0.61, 0.62]),
+        "decremental": variant([0.0, 0.0, 0.0], [0.2, 0.21, 0.22]),
+        "arft, adaptive": variant([0.3, 0.2, 0.1], [0.5, 0.7, 0.6]),
+    }
+    found = {of.claim: of.verdict for of in claims.of_comparison({"results": {"variants": variants}})}
+    assert found == {
+        "λ = 16: the kept clips are what fine-tuning without an anti-reward gives": "holds",
+        "decremental hurts the kept clips more": "holds",
+        "adaptive RSI resists forgetting": "open",
+        "adaptive RSI costs the kept clips": "open",
+    }
+
+
+def test_a_policy_that_falls_sooner_than_doing_nothing_has_not_lost_a_skill():
+    policies = {
+        "zero action": {"0": {"episode_length": [16.0, 18.0]}},
+        "λ = 8": {str(seed): {"episode_length": [17.0, 17.0 + seed]} for seed in range(3)},
+        "λ = 16": {str(seed): {"episode_length": [5.0, 6.0 + seed]} for seed in range(3)},
+    }
+    found = [of.verdict for of in claims.of_physical_behaviour({"results": {"policies": policies}})]
+    assert found == ["holds", "does not hold"]
+
+
+def test_what_comes_back_sooner_than_it_is_learned_was_not_forgotten():
+    def curve(at: int) -> dict:
+        tracking = [0.9 if step >= at else 0.1 for step in range(6)]
+        return {"iterations": list(range(6)), "target_steps": [100.0 * step for step in range(6)], "tracking": tracking}
+
+    starts = {"unlearned": {str(seed): curve(1 + seed % 2) for seed in range(3)}, "retrained": {"0": curve(4)}}
+    found = [of.verdict for of in claims.of_relearning({"results": {"base": 0.9, "starts": starts}})]
+    assert found == ["does not hold"] * 3
+    starts["retrained"]["0"] = curve(9)
+    found = list(claims.of_relearning({"results": {"base": 0.9, "starts": starts}}))
+    assert {of.verdict for of in found} == {"does not hold"}
+    assert "not reached within the run: retrained" in found[0].evidence
+
+
+def test_the_table_names_what_is_not_measured(tmp_path):
+    runs = variant([0.0, 0.0, 0.0], [0.6, 0.6, 0.6])
+    for run in runs["seeds"].values():
+        run["policy"]["target"]["episodes"] = 40
+    runs["over_seeds"] = {"policy": {"target": {"skill": over_seeds([0.1, 0.12, 0.11])}}}
+    document = {"asked": {"seeds": 3}, "results": {"variants": {"λ = 16": runs}}}
+    (tmp_path / "validity.json").write_text(json.dumps(document))
+    text = claims.table(tmp_path)
+    rows = [line for line in text.splitlines() if line.startswith("| [validity]")]
+    assert len(rows) == 3
+    assert all("**holds**" in row and row.endswith("| 3 |") for row in rows)
+    assert "0 % [0, 3]" in rows[0]
+    assert "Not measured yet: comparison, penalty," in text
+
+
+def test_the_readmes_table_is_that_of_the_stored_numbers():
+    text = claims.README.read_text()
+    assert claims.BLOCK.search(text)
+    assert claims.BLOCK.sub(lambda block: f"{block[1]}{claims.table()}{block[2]}", text) == text, "run `make tables`"
