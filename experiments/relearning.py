@@ -136,7 +136,7 @@ def draw(document: Mapping[str, Any]) -> Figure:
 STUDY = Study(
     name="relearning",
     title="How fast does a forgotten motion come back?",
-    iterations={"cpu": 260, "paper": 10_000},
+    iterations={"cpu": 400, "paper": 10_000},
     measure=measure,
     tell=tell,
     draw=draw,

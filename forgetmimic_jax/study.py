@@ -57,8 +57,8 @@ class Options:
     """Runs of each kind, with the seeds 0, 1, ...: what intervals are over."""
     episodes: int = 20
     """Evaluation episodes a clip."""
-    jobs: int = 1
-    """Trials at a time; each of them uses all cores of a CPU."""
+    jobs: int = 2
+    """Trials at a time; each of them uses all cores of a CPU, and two of them use these better than one."""
     trials: Path = Path("runs/trials")
     """Folder of the trials, in which every study finds the finished ones again."""
     physics: Literal["auto", "native", "mjx", "mjx-warp"] | None = None
