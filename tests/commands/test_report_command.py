@@ -80,7 +80,7 @@ def test_the_page_tells_what_was_asked_done_and_found(page, run, base_run):
         "is to forget turn and to keep the other 2 clips (nod, sway).",
         "arft: Anti-reward fine-tuning, the paper&#39;s method",
         "<th>Penalty λ</th><td>16</td>",
-        "2 iterations, 64 environment steps, 8 environments",
+        "2 iterations, 192 environment steps, 8 environments",
         "<th>Base&#39;s training</th><td>128 environment steps</td>",
         "0 (unlearning), 0 (evaluation)",
         "3 episodes a clip with deterministic actions",

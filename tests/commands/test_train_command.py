@@ -40,7 +40,7 @@ def test_a_run_leaves_its_settings_metrics_and_checkpoints(base_run, library_fol
     config = load_config(base_run.folder / "config.yaml")
     assert (config.preset, config.library, config.iterations) == ("cpu", str(library_folder), 4)
     assert (config.ppo.num_envs, config.ppo.actor_layers, config.wrench.max_gain) == (8, (16,), 0.5)
-    assert [row["iteration"] for row in base_run.rows] == [2, 4]
+    assert [row["iteration"] for row in base_run.rows] == [1, 2, 4]
     assert all(np.isfinite(value) for row in base_run.rows for value in row.values() if isinstance(value, float))
     assert sum(clip["step_share"] for clip in base_run.rows[0]["clips"].values()) == pytest.approx(1.0, abs=1e-4)
     info = checkpoint.read_info(base_run.checkpoint(4))
@@ -116,7 +116,7 @@ def test_training_may_go_on_from_a_base_with_other_clips(base_run, tmp_path, lib
 
 def test_what_a_base_lived_counts_for_the_training_that_goes_on_from_it(base_run, tmp_path, options):
     further = finished(train.main, options(output=tmp_path / "run", base=base_run.checkpoint(4), iterations=2))
-    assert [row["environment_steps"] for row in further.rows] == [(4 + 2) * 8 * 4]
+    assert [row["environment_steps"] for row in further.rows] == [(4 + done) * 8 * 4 for done in (1, 2)]
     assert checkpoint.read_info(further.checkpoint(2)).environment_steps == (4 + 2) * 8 * 4
 
 
