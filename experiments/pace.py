@@ -1,7 +1,7 @@
 """The trials behind unlearning's pace on a laptop: `python experiments/pace.py` writes the page from their evaluations.
 
-One seed each or two, so only large differences count. A row's settings are all that differs from today's `PACE`; to try one
-again: `make unlearn ITERATIONS=... ARGS="--set ..."`.
+One seed each or two, so only large differences count. A row's settings are all that differs from today's `PACE`; to
+try one again: `make unlearn ITERATIONS=... ARGS="--set ..."`.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ TRIALS = {
 
 TEXT = """# Unlearning's pace on a laptop
 
-λ = 16 on the shipped G1 base, seed 0 where no other is named, 20 episodes a clip; intervals over the episodes. `python experiments/pace.py`
-writes this page from `results/pace/`.
+λ = 16 on the shipped G1 base, seed 0 where no other is named, 20 episodes a clip; intervals over the episodes.
+`python experiments/pace.py` writes this page from `results/pace/`.
 
 {table}
 - Forgetting takes some hundred iterations, whatever their length: PPO's clip lets the policy go only so far in each. So
