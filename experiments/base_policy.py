@@ -78,7 +78,7 @@ GOING_ON = {
     "short": ("*level* after 4.8 M", "as *level*, `num_envs=1024 num_steps=4 branches=8 gae_lambda=0.5`"),
     "long": (
         "*level* after 4.8 M",
-        "as *level*, `num_steps=24 minibatches=12 gae_lambda=0.95 schedule=linear learning_rate=5e-5`",
+        "as *level*, `num_steps=24 minibatches=12 gae_lambda=0.95 learning_rate=5e-5`, falling linearly over the run",
     ),
     "longer": ("*long* after 4.1 M", "as *long*, `num_envs=256 num_steps=48 gae_lambda=0.97 learning_rate=4e-5`"),
 }

@@ -137,8 +137,8 @@ class PPOConfig:
     epochs: int = 5
     minibatches: int = 4
     learning_rate: float = 1e-3
-    # The step size follows the KL at every minibatch or iteration, stays, or falls in the second half of the run.
-    schedule: Literal["adaptive", "adaptive_iteration", "fixed", "linear"] = "adaptive"
+    # The step size follows the KL at every minibatch or iteration, stays, or rises, stays and falls over the run.
+    schedule: Literal["adaptive", "adaptive_iteration", "fixed", "trapezoid"] = "adaptive"
     target_kl: float = 0.01
     min_learning_rate: float = 1e-5
     max_learning_rate: float = 1e-2

@@ -9,6 +9,8 @@ from jax import Array
 from forgetmimic_jax.config import Config, PPOConfig
 from forgetmimic_jax.ppo.network import entropy, log_prob
 
+WARM_UP = 0.05  # of a run
+
 
 @struct.dataclass
 class Prediction:
@@ -87,7 +89,11 @@ def adapt_learning_rate(
     return jnp.clip(learning_rate * factor, min_learning_rate, max_learning_rate)
 
 
-def anneal_learning_rate(config: PPOConfig, progress: Array) -> Array:
-    """`learning_rate` until half of the run, then linearly down to `min_learning_rate` [] as progress [] goes to 1."""
-    left = jnp.clip(2.0 * (1.0 - progress), 0.0, 1.0)
-    return config.min_learning_rate + left * (config.learning_rate - config.min_learning_rate)
+def trapezoid(config: PPOConfig, progress: Array) -> Array:
+    """The step size [] at a progress [] through the run of 0 to 1.
+
+    It rises over the run's first twentieth, for a warm start's Adam knows no scale yet and its first steps are blind;
+    stays until half; and falls to `min_learning_rate`.
+    """
+    height = jnp.clip(jnp.minimum(progress / WARM_UP, 2.0 * (1.0 - progress)), 0.0, 1.0)
+    return config.min_learning_rate + height * (config.learning_rate - config.min_learning_rate)

@@ -17,7 +17,7 @@ from jax import Array
 from forgetmimic_jax.config import PPOConfig
 from forgetmimic_jax.ppo import network
 from forgetmimic_jax.ppo.gae import centre_branches, generalized_advantages
-from forgetmimic_jax.ppo.loss import Batch, Prediction, adapt_learning_rate, anneal_learning_rate
+from forgetmimic_jax.ppo.loss import Batch, Prediction, adapt_learning_rate, trapezoid
 from forgetmimic_jax.ppo.network import bound_std, kl_divergence, log_prob, normalize, update_normalizer
 from forgetmimic_jax.state import Policy, TrainState, make_actor, make_critic, make_optimizer
 from forgetmimic_jax.tracking import env as tracking
@@ -228,15 +228,16 @@ def improve(
         return jax.lax.scan(minibatch, carry, indices.reshape(config.minibatches, -1))
 
     key, epoch_key = jax.random.split(state.key)
-    carry = ((policy.actor, policy.critic), state.optimizer, state.learning_rate)
+    learning_rate = state.learning_rate
+    if config.schedule == "trapezoid":
+        learning_rate = trapezoid(config, state.iteration / env.config.iterations)
+    carry = ((policy.actor, policy.critic), state.optimizer, learning_rate)
     (params, optimizer_state, learning_rate), metrics = jax.lax.scan(
         epoch, carry, jax.random.split(epoch_key, config.epochs)
     )
     metrics = {name: value.mean() for name, value in metrics.items()} | {"kl_final": metrics["kl"][-1].mean()}
     if config.schedule == "adaptive_iteration":
         learning_rate = adapt(learning_rate, metrics["kl_final"])
-    elif config.schedule == "linear":
-        learning_rate = anneal_learning_rate(config, (state.iteration + 1) / env.config.iterations)
     metrics["learning_rate"] = learning_rate
     metrics["std"] = jnp.exp(old_log_std).mean()
     new_policy = dataclasses.replace(policy, actor=params[0], critic=params[1])

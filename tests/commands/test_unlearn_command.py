@@ -55,7 +55,7 @@ def test_its_settings_are_the_base_s_but_for_what_unlearning_changes(base_run, u
         wrench=dataclasses.replace(base.wrench, max_gain=0.0),
         ppo=dataclasses.replace(
             base.ppo,
-            **{"schedule": "linear", "learning_rate": 3e-4, "clip_value": False},
+            **{"schedule": "trapezoid", "learning_rate": 3e-4, "clip_value": False},
             **{"num_steps": 12, "minibatches": 4, "epochs": 2},
         ),
     )

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from forgetmimic_jax.config import PPOConfig
-from forgetmimic_jax.ppo.loss import adapt_learning_rate, anneal_learning_rate, policy_loss, value_loss
+from forgetmimic_jax.ppo.loss import adapt_learning_rate, policy_loss, trapezoid, value_loss
 
 
 @pytest.mark.parametrize(
@@ -70,7 +70,10 @@ def test_learning_rate_stays_in_its_bounds():
     assert float(adapt_learning_rate(jnp.array(9e-3), jnp.array(1e-4), 0.01, 1e-5, 1e-2)) == pytest.approx(1e-2)
 
 
-@pytest.mark.parametrize(("progress", "rate"), [(0.0, 1e-3), (0.5, 1e-3), (0.75, 5.5e-4), (1.0, 1e-4), (1.5, 1e-4)])
-def test_linear_learning_rate_falls_to_its_minimum_in_the_second_half(progress, rate):
+@pytest.mark.parametrize(
+    ("progress", "rate"),
+    [(0.0, 1e-4), (0.025, 5.5e-4), (0.05, 1e-3), (0.5, 1e-3), (0.75, 5.5e-4), (1.0, 1e-4), (1.5, 1e-4)],
+)
+def test_a_trapezoid_rises_stays_and_falls(progress, rate):
     config = PPOConfig(learning_rate=1e-3, min_learning_rate=1e-4)
-    assert float(anneal_learning_rate(config, jnp.array(progress))) == pytest.approx(rate, rel=1e-6)
+    assert float(trapezoid(config, jnp.array(progress))) == pytest.approx(rate, rel=1e-6)

@@ -282,12 +282,12 @@ def test_once_an_iteration_the_schedule_follows_the_last_epochs_kl(problem):
         assert float(after.learning_rate) == pytest.approx(learning_rate * factor)
 
 
-def test_the_linear_schedule_is_where_the_run_is(problem):
+def test_the_trapezoid_is_where_the_run_is(problem):
     env, state, batch, advantage, target = problem
-    ppo = dataclasses.replace(env.config.ppo, schedule="linear", learning_rate=1e-3, min_learning_rate=0.0)
+    ppo = dataclasses.replace(env.config.ppo, schedule="trapezoid", learning_rate=1e-3, min_learning_rate=0.0)
     config = dataclasses.replace(env.config, iterations=10, ppo=ppo)
     run = SimpleNamespace(config=config, robot=env.robot, assets=env.assets)
-    for iteration, learning_rate in ((3, 1e-3), (6, 6e-4), (9, 0.0)):
+    for iteration, learning_rate in ((0, 0.0), (1, 1e-3), (5, 1e-3), (7, 6e-4), (9, 2e-4)):
         after, _ = improved(run, dataclasses.replace(state, iteration=jnp.int32(iteration)), batch, advantage, target)
         assert float(after.learning_rate) == pytest.approx(learning_rate)
 
