@@ -17,8 +17,8 @@ from pathlib import Path
 HERE = Path(__file__).parent
 RESULT = HERE / "results" / "parallel_trials.json"
 PAGE = HERE / "parallel_trials.md"
-JOBS, ROUNDS = (1, 2, 3), 3
-ITERATIONS, SETTLED = 30, 10  # of each training; those after the tenth count
+JOBS, ROUNDS = (1, 2), 2
+ITERATIONS, SETTLED = 20, 10  # of each training; those after the tenth count
 
 TEXT = """# Several trainings at once
 
