@@ -44,8 +44,8 @@ TEXT = """# Unlearning's pace on a laptop
 - What is kept pays for a short look-ahead: with 8 steps it lost more in half as many environment steps.
 - A step size that falls from the start leaves the targets half-way; one that stays for half of the run does not, and
   what is kept settles in the second half. At 2e-4 that depended on the seed.
-- At this pace fine-tuning alone, without any anti-reward, wears the policy down as much as forgetting does, the cartwheel
-  first: what the kept clips lose is the price of the pace, and not of the anti-reward.
+- At this pace fine-tuning alone, without any anti-reward, wears the policy down as much as forgetting does, the
+  cartwheel first: what the kept clips lose is the price of the pace, and not of the anti-reward.
 - More starts for the targets make it faster, at a price for what is kept. The paper draws clips uniformly, and so do
   we: with a share of our own the samplers could not be compared.
 """
