@@ -58,7 +58,7 @@ class Options:
     episodes: int = 20
     """Evaluation episodes a clip."""
     jobs: int = 2
-    """Trials at a time; each of them uses all cores of a CPU, and two of them use these better than one."""
+    """Trials at a time; each of them uses all cores of a CPU (experiments/parallel_trials.py)."""
     trials: Path = Path("runs/trials")
     """Folder of the trials, in which every study finds the finished ones again."""
     physics: Literal["auto", "native", "mjx", "mjx-warp"] | None = None
