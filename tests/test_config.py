@@ -115,7 +115,7 @@ def test_the_hash_does_not_see_how_long_or_how_often(name):
         ({"ppo": {"actor_layers": [256, "x"]}}, "here: ppo: actor_layers: expected int, found 'x'"),
         (
             {"ppo": {"schedule": "cosine"}},
-            "here: ppo: schedule: found 'cosine', accepted: adaptive, adaptive_iteration, fixed, linear",
+            "here: ppo: schedule: found 'cosine', accepted: adaptive, adaptive_iteration, fixed, trapezoid",
         ),
         ({"unlearn": {"targets": "punch"}}, "here: unlearn: targets: expected a list, found 'punch'"),
         ({"library": 5}, "here: library: expected str, found 5"),

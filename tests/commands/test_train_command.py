@@ -143,7 +143,7 @@ def test_settings_given_twice_add_up():
         ({"set": [["ppo.epochs=[1"]]}, "--set ppo.epochs=[1: '[1' is no value; expected a number, a word or [a, list]"),
         (
             {"set": [["ppo.schedule=cosine"]]},
-            "--set: ppo: schedule: found 'cosine', accepted: adaptive, adaptive_iteration, fixed, linear",
+            "--set: ppo: schedule: found 'cosine', accepted: adaptive, adaptive_iteration, fixed, trapezoid",
         ),
         ({"set": [[*TINY, "ppo.num_envs=0"]]}, "ppo.num_envs: found 0; accepted: 1 or more"),
         (
