@@ -21,10 +21,9 @@ from forgetmimic_jax.errors import InputError, run_command
 from forgetmimic_jax.evaluation import statistics
 from forgetmimic_jax.evaluation.statistics import Estimate
 from forgetmimic_jax.evaluation.tables import FORGOTTEN, markdown_table, number, percent
-from forgetmimic_jax.evaluation.variants import over_seeds
 from forgetmimic_jax.motion.clip import write_atomically
 from forgetmimic_jax.study import RESULTS
-from forgetmimic_jax.sweep import half_gone, skill_by_seed
+from forgetmimic_jax.sweep import half_gone_by_seed
 
 README = Path(__file__).parent / "README.md"
 BLOCK = re.compile(r"(<!-- claims:start -->\n).*?(<!-- claims:end -->)", re.DOTALL)
@@ -73,10 +72,10 @@ def of_validity(document: Mapping[str, Any]) -> Iterator[Finding]:
     """Fig. 2: forgotten and kept."""
     variants = document["results"]["variants"]
     for label, variant in variants.items():
-        success = over_seeds([run["policy"]["target"] for run in variant["seeds"].values()])[SUCCESS]
+        target = variant["over_seeds"]["policy"]["target"]
+        success, skill = target[SUCCESS], target.get("skill")
         claim = f"{label}: the targets no longer succeed"
         yield Finding(claim, judged(success, NONE), f"target success {percent(success)}; at most {NONE:.0%} asked")
-        skill = variant["over_seeds"]["policy"]["target"].get("skill")
         if skill:
             evidence = f"{percent(skill)} of the skill above the zero action is left; at most {FORGOTTEN:.0%} asked"
             yield Finding(f"{label}: the skill is gone", judged(skill, FORGOTTEN), evidence)
@@ -109,7 +108,7 @@ def of_comparison(document: Mapping[str, Any]) -> Iterator[Finding]:
 def of_penalty(document: Mapping[str, Any]) -> Iterator[Finding]:
     """Table 2: where the targets tip over."""
     variants = document["results"]["variants"]
-    crossed = [penalty for penalty in map(half_gone, skill_by_seed(variants).values()) if penalty]
+    crossed, _ = half_gone_by_seed(variants)
     if crossed:
         found = statistics.over_seeds(crossed)
         crit = next(iter(variants.values()))["over_seeds"].get("lambda_crit")
@@ -155,13 +154,10 @@ def of_relearning(document: Mapping[str, Any]) -> Iterator[Finding]:
     if not {"unlearned", "retrained"} <= starts.keys():
         return
     for share in relearning.SHARES:
-        steps = {}
-        for label in ("unlearned", "retrained"):
-            curves = starts[label].values()
-            found = [relearning.crossing(curve, share * base) for curve in curves]
-            steps[label] = [pair[1] if pair else None for pair in found]
-        mine = [step for step in steps["unlearned"] if step is not None]
-        theirs = [step for step in steps["retrained"] if step is not None]
+        mine, theirs = (
+            [found[1] for curve in starts[label].values() if (found := relearning.crossing(curve, share * base))]
+            for label in ("unlearned", "retrained")
+        )
         claim = f"{share:.0%} of the tracking comes back no sooner than it comes to a policy that never had it"
         if not mine or not theirs:
             never = " and ".join(label for label, of in (("unlearned", mine), ("retrained", theirs)) if not of)

@@ -11,12 +11,13 @@ square, and the angle to the gradient of λ = 1 with the longest look-ahead, whi
 from __future__ import annotations
 
 import dataclasses
-import json
 import operator
 import sys
 from pathlib import Path
 
 import numpy as np
+
+from forgetmimic_jax.study import measured_page
 
 HERE = Path(__file__).parent
 RESULT = HERE / "results" / "gradient_noise.json"
@@ -169,17 +170,12 @@ def page(found: dict) -> str:
     )
 
 
-def main() -> None:
-    """Measure a checkpoint (the shipped base by default), or with --draw only draw; write the numbers and the page."""
+def named_policy() -> Path:
+    """The checkpoint on the command line, or the shipped base."""
     from forgetmimic_jax import runner
 
-    arguments = sys.argv[1:]
-    if "--draw" not in arguments:
-        policy = Path(arguments[0]) if arguments else runner.base_folder("g1")
-        RESULT.write_text(json.dumps(measure(policy), indent=1) + "\n")
-    PAGE.write_text(page(json.loads(RESULT.read_text())))
-    print(f"numbers  {RESULT}\npage     {PAGE}")
+    return Path(sys.argv[1]) if sys.argv[1:] else runner.base_folder("g1")
 
 
 if __name__ == "__main__":
-    main()
+    measured_page(lambda: measure(named_policy()), page, RESULT, PAGE)

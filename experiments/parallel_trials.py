@@ -14,6 +14,8 @@ import sys
 import tempfile
 from pathlib import Path
 
+from forgetmimic_jax.study import measured_page
+
 HERE = Path(__file__).parent
 RESULT = HERE / "results" / "parallel_trials.json"
 PAGE = HERE / "parallel_trials.md"
@@ -30,7 +32,7 @@ rounds. `python experiments/parallel_trials.py` measures it again, `--draw` rewr
 |---|---|---|---|
 {rows}
 
-`--jobs` of the studies and sweeps is how many of their trials run at once; 2 by default, for this table.
+`--jobs` of the studies and sweeps is how many of their trials run at once.
 """
 
 
@@ -69,13 +71,5 @@ def page(found: dict) -> str:
     return TEXT.format(cores=found["cores"], rounds=found["rounds"], rows="\n".join(rows))
 
 
-def main() -> None:
-    """Measure, unless told to draw only; write the numbers and the page."""
-    if "--draw" not in sys.argv[1:]:
-        RESULT.write_text(json.dumps(measure(), indent=1) + "\n")
-    PAGE.write_text(page(json.loads(RESULT.read_text())))
-    print(f"numbers  {RESULT}\npage     {PAGE}")
-
-
 if __name__ == "__main__":
-    main()
+    measured_page(measure, page, RESULT, PAGE)

@@ -8,13 +8,13 @@ has all the iterations it wants. Run it with nothing else on the cores; `--draw`
 from __future__ import annotations
 
 import copy
-import json
 import statistics
-import sys
 import time
 from pathlib import Path
 
 import numpy as np
+
+from forgetmimic_jax.study import measured_page
 
 HERE = Path(__file__).parent
 RESULT = HERE / "results" / "physics_cost.json"
@@ -177,13 +177,5 @@ def page(found: dict) -> str:
     )
 
 
-def main() -> None:
-    """Measure, unless told to draw only; write the numbers and the page."""
-    if "--draw" not in sys.argv[1:]:
-        RESULT.write_text(json.dumps(measure(), indent=1) + "\n")
-    PAGE.write_text(page(json.loads(RESULT.read_text())))
-    print(f"numbers  {RESULT}\npage     {PAGE}")
-
-
 if __name__ == "__main__":
-    main()
+    measured_page(measure, page, RESULT, PAGE)

@@ -330,6 +330,14 @@ def variants_study(
     )
 
 
+def measured_page(measure: Callable[[], Any], page: Callable[[Any], str], result: Path, path: Path) -> None:
+    """The command of a measurement without trials: its numbers, unless `--draw` is given, and from them its page."""
+    if "--draw" not in sys.argv[1:]:
+        write_atomically(result, (json.dumps(measure(), indent=1) + "\n").encode())
+    write_atomically(path, page(json.loads(result.read_text())).encode())
+    print(f"numbers  {result}\npage     {path}")
+
+
 def main(study: Study, options: type[Options] = Options, arguments: Iterable[str] | None = None) -> None:
     """The command of a study's file."""
     program = f"python -m experiments.{study.name}"

@@ -127,12 +127,11 @@ def _tell_lambda(variants: Mapping[str, Any]) -> str:
             "On the base's own target steps the mean reward changes its sign at λ_crit = W (1 + R_reg / R_track) = "
             f"{number(first['lambda_crit'], 2)}; W = 8 leaves the other rewards out.\n"
         )
-    seeds = skill_by_seed(variants)
-    crossed = [at for at in map(half_gone, seeds.values()) if at]
+    crossed, seeds = half_gone_by_seed(variants)
     if crossed:
         lines.append(
             f"Half of the base's skill on the targets is gone at λ = {number(statistics.over_seeds(crossed), 2)} "
-            f"({len(crossed)} of {len(seeds)} seeds; between two penalties, on a straight line in log λ). That is how "
+            f"({len(crossed)} of {seeds} seeds; between two penalties, on a straight line in log λ). That is how "
             "far this budget gets: a longer run may tip over earlier.\n"
         )
     lines.append(
@@ -142,14 +141,14 @@ def _tell_lambda(variants: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def skill_by_seed(variants: Mapping[str, Any]) -> dict[str, dict[float, float]]:
-    """The share of the base's skill that is left on the targets, by seed and penalty."""
+def half_gone_by_seed(variants: Mapping[str, Any]) -> tuple[list[float], int]:
+    """The penalty at which half of the skill is gone, for each seed that got there, and of how many seeds."""
     skills: dict[str, dict[float, float]] = {}
     for variant in variants.values():
         for seed, run in variant["seeds"].items():
             if "skill" in run["policy"]["target"]:
                 skills.setdefault(seed, {})[float(variant["options"]["penalty"])] = run["policy"]["target"]["skill"]
-    return skills
+    return [penalty for penalty in map(half_gone, skills.values()) if penalty], len(skills)
 
 
 def half_gone(skills: Mapping[float, float]) -> float | None:

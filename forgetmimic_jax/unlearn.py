@@ -71,8 +71,12 @@ class Options:
 ITERATIONS = {"cpu": 320, "paper": 1000}
 # On a laptop: short iterations, for forgetting takes some hundred whatever their length (experiments/pace.md).
 PACE: dict[str, Any] = {
-    **{"schedule": "trapezoid", "learning_rate": 3e-4, "clip_value": False},
-    **{"num_steps": 12, "minibatches": 4, "epochs": 2},
+    "num_steps": 12,
+    "minibatches": 4,
+    "epochs": 2,
+    "schedule": "trapezoid",
+    "learning_rate": 3e-4,
+    "clip_value": False,
 }
 
 

@@ -46,10 +46,12 @@ def summary(folder: Path) -> dict[str, Any]:
     document = json.loads((folder / "evaluation.json").read_text())
     result: dict[str, Any] = {}
     for name, policy in document["policies"].items():
-        groups = {group: _means(policy[group]) for group in ("target", "kept") if group in policy}
+        groups = {
+            group: {**_means(policy[group]), EPISODES: policy[group]["success_rate"]["n"]}
+            for group in ("target", "kept")
+            if group in policy
+        }
         clips = {clip: _means(metrics) for clip, metrics in policy["clips"].items()}
-        for of in groups:
-            groups[of][EPISODES] = policy[of]["success_rate"]["n"]
         ratios = {ratio: policy[ratio]["mean"] for ratio in RATIOS if "mean" in policy.get(ratio, {})}
         result[name if name in (BASE, ZERO_ACTION) else "policy"] = {**groups, "clips": clips, **ratios}
     rows = read_rows(folder / "metrics.jsonl")
@@ -75,7 +77,7 @@ def over_seeds(runs: Sequence[Any]) -> Any:
     names = dict.fromkeys(name for run in runs for name in run)
     result = {name: over_seeds([run[name] for run in runs if name in run]) for name in names}
     if EPISODES in result and result["success_rate"].get("std", 1.0) < 1e-9:
-        # Seeds that all fail have no spread to learn from: the exact interval of all episodes together.
+        # No spread to learn from, as where all fail.
         episodes = sum(run[EPISODES] for run in runs)
         pooled = statistics.rate(round(result["success_rate"]["mean"] * episodes), episodes)
         result["success_rate"] |= {end: pooled[end] for end in ("low", "high")}

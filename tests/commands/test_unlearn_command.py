@@ -55,8 +55,12 @@ def test_its_settings_are_the_base_s_but_for_what_unlearning_changes(base_run, u
         wrench=dataclasses.replace(base.wrench, max_gain=0.0),
         ppo=dataclasses.replace(
             base.ppo,
-            **{"schedule": "trapezoid", "learning_rate": 3e-4, "clip_value": False},
-            **{"num_steps": 12, "minibatches": 4, "epochs": 2},
+            num_steps=12,
+            minibatches=4,
+            epochs=2,
+            schedule="trapezoid",
+            learning_rate=3e-4,
+            clip_value=False,
         ),
     )
 

@@ -3,6 +3,7 @@ import json
 import pytest
 
 from experiments import claims
+from forgetmimic_jax.evaluation import variants
 from forgetmimic_jax.evaluation.statistics import over_seeds
 
 
@@ -39,21 +40,21 @@ def variant(target: list[float], kept: list[float], base: float = 0.6) -> dict:
 
 
 def test_differences_are_between_runs_of_the_same_seed():
-    variants = {"a": variant([0.0, 0.1], [0.5, 0.7]), "b": variant([0.1], [0.45])}
-    assert claims.gained(variants, "a", None, "kept", "success_rate")["mean"] == pytest.approx(0.0)
-    only = claims.gained(variants, "a", "b", "kept", "success_rate")
+    found = {"a": variant([0.0, 0.1], [0.5, 0.7]), "b": variant([0.1], [0.45])}
+    assert claims.gained(found, "a", None, "kept", "success_rate")["mean"] == pytest.approx(0.0)
+    only = claims.gained(found, "a", "b", "kept", "success_rate")
     assert only == {"mean": pytest.approx(0.05), "n": 1}
-    assert claims.gained(variants, "a", "c", "kept", "success_rate") is None
+    assert claims.gained(found, "a", "c", "kept", "success_rate") is None
 
 
 def test_the_comparisons_claims_by_hand():
-    variants = {
+    compared = {
         claims.ARFT: variant([0.1, 0.1, 0.1], [0.59, 0.60, 0.61]),
         claims.comparison.CONTROL: variant([0.8, 0.8, 0.8], [0.60, 0.61, 0.62]),
         "decremental": variant([0.0, 0.0, 0.0], [0.2, 0.21, 0.22]),
         "arft, adaptive": variant([0.3, 0.2, 0.1], [0.5, 0.7, 0.6]),
     }
-    found = {of.claim: of.verdict for of in claims.of_comparison({"results": {"variants": variants}})}
+    found = {of.claim: of.verdict for of in claims.of_comparison({"results": {"variants": compared}})}
     assert found == {
         "λ = 16: the kept clips are what fine-tuning without an anti-reward gives": "holds",
         "decremental hurts the kept clips more": "holds",
@@ -88,9 +89,9 @@ def test_what_comes_back_sooner_than_it_is_learned_was_not_forgotten():
 
 def test_the_table_names_what_is_not_measured(tmp_path):
     runs = variant([0.0, 0.0, 0.0], [0.6, 0.6, 0.6])
-    for run in runs["seeds"].values():
-        run["policy"]["target"]["episodes"] = 40
-    runs["over_seeds"] = {"policy": {"target": {"skill": over_seeds([0.1, 0.12, 0.11])}}}
+    success = variants.over_seeds([{"success_rate": 0.0, "episodes": 40}] * 3)["success_rate"]
+    skill = over_seeds([0.1, 0.12, 0.11])
+    runs["over_seeds"] = {"policy": {"target": {"success_rate": success, "skill": skill}}}
     document = {"asked": {"seeds": 3}, "results": {"variants": {"λ = 16": runs}}}
     (tmp_path / "validity.json").write_text(json.dumps(document))
     text = claims.table(tmp_path)
