@@ -69,7 +69,8 @@ class Retarget:
 @dataclass
 class Check:
     """Measure every clip against the bar: floor contact, joint limits, smoothness, seams, flight. Exit code 2 if one
-    fails."""
+    fails. Without a bar: *missing*, the acceleration that no contact gives in the worst 0.2 s. Clips with much of it
+    are not learned (experiments/base_policy.md)."""
 
     library: Path | None = None
     """Folder of clips; data/ROBOT by default."""
@@ -268,6 +269,7 @@ COLUMNS = {  # of the table: title, unit, and how a Quality's field is printed
     "jitter": ("jitter", "%", "{:.2f}", 100.0),
     "seam": ("seam", "x", "{:.2f}", 1.0),
     "flight_acceleration": ("flight", "m/s2", "{:.1f}", 1.0),
+    "missing_acceleration": ("missing", "m/s2", "{:.1f}", 1.0),
 }
 
 

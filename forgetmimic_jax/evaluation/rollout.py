@@ -114,9 +114,10 @@ def act(env: Environment, policy: Policy | None, observation: Array) -> Array:
 
 
 def evaluation_config(config: Config) -> Config:
-    """The config with randomisation and the wrench off; reset noise stays."""
+    """The config with randomisation and the wrench off and episodes of full length; reset noise stays."""
     return dataclasses.replace(
         config,
+        max_episode_steps=Config.max_episode_steps,
         noise=dataclasses.replace(config.noise, enabled=False),
         wrench=dataclasses.replace(config.wrench, max_gain=0.0),
     )

@@ -6,11 +6,14 @@ at the touching points supplies, is the residual that the refinement drives down
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 from scipy.optimize import nnls
 
+from forgetmimic_jax.motion.contact import FloorPoints, floor_positions
 from forgetmimic_jax.motion.least_squares import Term
 from forgetmimic_jax.motion.timeline import Timeline, cross_matrix
+from forgetmimic_jax.robot import Robot
 
 RADIUS = 0.3  # m, over which a moment counts as a force
 FRICTION = 0.7
@@ -48,25 +51,14 @@ def floor_wrench(
         fps: frames per s.
         weight: per m/s^2.
     """
-    here, _ = timeline.having(1)
     change, before, after = timeline.changes(qpos)
-    between = 0.5 * (momentum[here] + timeline.vectors(momentum, here, 1))  # from each frame to the next
+    between = _between(timeline, momentum)
     first, _ = timeline.having(2)
     second = (first + 1) % timeline.frames
     between_second = timeline.vectors(between, first, 1)
-    spin = np.einsum("tij,tj->ti", between_second, change[second]) - np.einsum(
-        "tij,tj->ti", between[first], change[first]
-    )
-    com_1, jac_1 = timeline.positions(com, first, 1), timeline.vectors(com_jac, first, 1)
-    com_2, jac_2 = timeline.positions(com, first, 2), timeline.vectors(com_jac, first, 2)
-    points_1 = timeline.positions(points, first, 1)
-
-    force = (com_2 - 2.0 * com_1 + com[first]) * fps**2 - GRAVITY
+    jac_1, jac_2 = (timeline.vectors(com_jac, first, ahead) for ahead in (1, 2))
     rate = fps**2 / (mass * RADIUS)
-    needed = np.concatenate([force, rate * spin], axis=-1)
-    touching = (points_1[..., 2] < TOUCHING) & ~flight[second, None]
-    given, project = floor_answer(needed, points_1 - com_1[:, None], touching)
-    missing = needed - given
+    missing, given, project = _missing(timeline, change, com, between, points, flight, rate, fps)
     robust = weight * (1.0 + np.sum(missing**2, axis=-1) / SURE**2) ** -0.25
     lever = -cross_matrix(given[:, :3]) / RADIUS @ jac_1
     blocks = {
@@ -82,6 +74,62 @@ def floor_wrench(
         robust[:, None] * missing,
         {offset: robust[:, None, None] * (project @ np.concatenate(block, axis=1)) for offset, block in blocks.items()},
     )
+
+
+def missing_acceleration(robot: Robot, floor: FloorPoints, qpos: np.ndarray, fps: float) -> np.ndarray:
+    """What a motion needs and the floor cannot give, per unit of mass: [frame - 2, 6] m/s^2 as in `floor_wrench`.
+
+    Args:
+        robot: the robot.
+        floor: its points that can touch the floor.
+        qpos: [frame, nq].
+        fps: frames per s.
+    """
+    model, data = robot.model, mujoco.MjData(robot.model)
+    com, momentum = np.empty((len(qpos), 3)), np.empty((len(qpos), 3, model.nv))
+    for frame, row in enumerate(qpos):
+        data.qpos[:] = row
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        com[frame] = data.subtree_com[1]
+        mujoco.mj_angmomMat(model, data, momentum[frame], 1)
+    timeline = Timeline(len(qpos), None)
+    change, _, _ = timeline.changes(qpos)
+    points, none = floor_positions(robot, floor, qpos), np.zeros(len(qpos), bool)
+    rate = fps**2 / (float(model.body_subtreemass[1]) * RADIUS)
+    return _missing(timeline, change, com, _between(timeline, momentum), points, none, rate, fps)[0]
+
+
+def _between(timeline: Timeline, momentum: np.ndarray) -> np.ndarray:
+    """The momentum matrix from each frame to the next."""
+    here, _ = timeline.having(1)
+    return 0.5 * (momentum[here] + timeline.vectors(momentum, here, 1))
+
+
+def _missing(
+    timeline: Timeline,
+    change: np.ndarray,
+    com: np.ndarray,
+    between: np.ndarray,
+    points: np.ndarray,
+    flight: np.ndarray,
+    rate: float,
+    fps: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What is missing [row, 6], what the floor gives, and `floor_answer`'s projector, at each frame with two ahead."""
+    first, _ = timeline.having(2)
+    second = (first + 1) % timeline.frames
+    com_1, com_2 = (timeline.positions(com, first, ahead) for ahead in (1, 2))
+    force = (com_2 - 2.0 * com_1 + com[first]) * fps**2 - GRAVITY
+    ahead, here = (
+        np.einsum("tij,tj->ti", timeline.vectors(between, first, 1), change[second]),
+        np.einsum("tij,tj->ti", between[first], change[first]),
+    )
+    needed = np.concatenate([force, rate * (ahead - here)], axis=-1)
+    points_1 = timeline.positions(points, first, 1)
+    touching = (points_1[..., 2] < TOUCHING) & ~flight[second, None]
+    given, project = floor_answer(needed, points_1 - com_1[:, None], touching)
+    return needed - given, given, project
 
 
 def floor_answer(needed: np.ndarray, levers: np.ndarray, touching: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

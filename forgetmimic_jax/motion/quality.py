@@ -1,4 +1,4 @@
-"""How well a clip suits the robot: floor contact, joint limits, smoothness, seams and free flight, against a bar."""
+"""How well a clip suits the robot: floor contact, joint limits, smoothness, seams and dynamics, against a bar."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from forgetmimic_jax.motion.clip import Clip
 from forgetmimic_jax.motion.contact import SIDES, FloorPoints, floor_points, floor_positions
+from forgetmimic_jax.motion.dynamics import missing_acceleration
 from forgetmimic_jax.motion.kinematics import configuration, rate
 from forgetmimic_jax.robot import Robot
 
@@ -17,6 +19,7 @@ STANCE_SPEED = 0.3  # m/s: … and this slow stands
 TOUCHING = 0.01  # m: a sole point this low touches the floor
 FLIGHT_CLEARANCE = 0.02  # m: with every point above it the robot flies
 FLIGHT_FRAMES = 5  # shorter hops hold no acceleration worth reading
+MISSING_SECONDS = 0.2  # a single frame's acceleration says little
 JITTER_HZ = 12.0  # a body's own motion is slower
 
 # The bar a clip has to pass.
@@ -44,6 +47,7 @@ class Quality:
     jitter: float  # share of the joint velocity's power above JITTER_HZ
     seam: float | None  # velocity jump where cycles meet, over the largest change elsewhere; cyclic clips
     flight_acceleration: float | None  # m/s^2, vertical, of the centre of mass, median of flight
+    missing_acceleration: float | None  # m/s^2 that no contact gives, the worst mean over MISSING_SECONDS
 
     def failures(self) -> list[str]:
         """What misses the bar, in words; empty where the clip passes."""
@@ -101,6 +105,7 @@ def measure(robot: Robot, clip: Clip, cycle_frames: int | None = None) -> Qualit
         jitter=_jitter(joint_vel, clip.fps),
         seam=None if cycle_frames is None else seam_ratio(joint_vel, cycle_frames),
         flight_acceleration=_flight_acceleration(robot, qpos, height.min(axis=1), clip.fps),
+        missing_acceleration=_worst(missing_acceleration(robot, points, qpos, clip.fps), clip.fps),
     )
 
 
@@ -116,6 +121,15 @@ def seam_ratio(joint_vel: np.ndarray, cycle_frames: int) -> float | None:
     if not at_seam.any() or at_seam.all():
         return None
     return float(change[at_seam].max() / max(change[~at_seam].max(), 1e-9))
+
+
+def _worst(missing: np.ndarray, fps: float) -> float | None:
+    """Largest length of the mean over MISSING_SECONDS; None for a shorter clip."""
+    window = round(MISSING_SECONDS * fps)
+    if len(missing) < window:
+        return None
+    means = sliding_window_view(missing, window, axis=0).mean(axis=-1)
+    return float(np.linalg.norm(means, axis=-1).max())
 
 
 def _stance_height(points: FloorPoints, positions: np.ndarray, fps: float) -> float | None:

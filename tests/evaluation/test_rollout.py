@@ -62,10 +62,12 @@ def test_a_single_episode_starts_at_the_beginning():
     assert not episode_starts(np.array([300]), 1, seed=0)[1].any()
 
 
-def test_evaluation_has_no_randomisation_and_no_wrench_but_the_reset_noise(tiny_config):
-    trained = dataclasses.replace(tiny_config, wrench=dataclasses.replace(tiny_config.wrench, max_gain=0.6))
+def test_evaluation_has_no_randomisation_and_no_wrench_but_the_reset_noise_and_full_episodes(tiny_config):
+    wrench = dataclasses.replace(tiny_config.wrench, max_gain=0.6)
+    trained = dataclasses.replace(tiny_config, wrench=wrench, max_episode_steps=120)
     config = evaluation_config(trained)
     assert config.wrench.max_gain == 0.0
+    assert config.max_episode_steps == 500
     assert config.noise == dataclasses.replace(trained.noise, enabled=False)
 
 

@@ -72,6 +72,20 @@ def test_flight_falls_with_gravity(robot, standing):
     slow = hop(2.0, 0.88)
     assert slow.flight_acceleration == pytest.approx(-2.0, abs=0.01)
     assert any("-2.0 m/s^2" in failure for failure in slow.failures())
+    assert hop(9.81, 0.4).missing_acceleration == pytest.approx(0.0, abs=1e-6)
+    assert slow.missing_acceleration == pytest.approx(9.81 - 2.0, abs=0.01)
+
+
+def test_a_push_the_floor_cannot_give(robot, standing):
+    """Sliding sideways at 9.81 m/s² needs as much friction as weight; 0.7 of it is there (and the robot would tip)."""
+    time = np.arange(100) / 50.0
+    shove = quality.measure(robot, moved(standing, 0.5 * 9.81 * time[:, None] ** 2 * [0.0, 1.0, 0.0]))
+    assert shove.missing_acceleration > 0.3 * 9.81
+    assert quality.measure(robot, dataclasses.replace(standing, **_first(standing, 8))).missing_acceleration is None
+
+
+def _first(clip, frames):
+    return {name: getattr(clip, name)[:frames] for name in ("root_pos", "root_quat", "joint_pos")}
 
 
 def test_joint_limits_and_speed(robot, standing):
