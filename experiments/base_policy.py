@@ -68,7 +68,7 @@ survival-weighted tracking (success) at the environment steps since the start.
   is not where the true one does ([the gradient's bias](gradient_noise.md)). *Short*, which trusts the critic sooner
   still, is the worse policy. *Long* and *longer* pay for a truer direction with noise, and improve again.
 
-## Clips that no training brings
+## Clips that were not learned
 
 What the shipped base does (100 episodes a clip) beside what each clip asks for that no contact with the floor gives:
 the largest mean over 0.2 s, force and moment together, as `make motions ARGS=check` measures it (*missing*).
@@ -76,8 +76,8 @@ the largest mean over 0.2 s, force and moment together, as `make motions ARGS=ch
 {clips}
 
 The clips that were never learned are those that ask for the most: a hop that hovers, a turn that speeds up in the air.
-The adaptive sampler gives them most of its starts, and the starts are lost. So look at *missing* before training on
-clips of your own.
+The adaptive sampler starts there again and again, for nothing. So look at *missing* before training on clips of your
+own.
 """
 GOING_ON = {
     "plain": ("base of 6.0 M steps", "`num_envs=256 num_steps=16 gae_lambda=0.9 learning_rate=2e-4`"),

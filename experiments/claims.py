@@ -21,6 +21,7 @@ from forgetmimic_jax.errors import InputError, run_command
 from forgetmimic_jax.evaluation import statistics
 from forgetmimic_jax.evaluation.statistics import Estimate
 from forgetmimic_jax.evaluation.tables import FORGOTTEN, markdown_table, number, percent
+from forgetmimic_jax.evaluation.variants import within
 from forgetmimic_jax.motion.clip import write_atomically
 from forgetmimic_jax.study import RESULTS
 from forgetmimic_jax.sweep import half_gone_by_seed
@@ -75,7 +76,8 @@ def of_validity(document: Mapping[str, Any]) -> Iterator[Finding]:
         target = variant["over_seeds"]["policy"]["target"]
         success, skill = target[SUCCESS], target.get("skill")
         claim = f"{label}: the targets no longer succeed"
-        yield Finding(claim, judged(success, NONE), f"target success {percent(success)}; at most {NONE:.0%} asked")
+        evidence = f"target success {percent(within(success, 0.0, 1.0))}; at most {NONE:.0%} asked"
+        yield Finding(claim, judged(success, NONE), evidence)
         if skill:
             evidence = f"{percent(skill)} of the skill above the zero action is left; at most {FORGOTTEN:.0%} asked"
             yield Finding(f"{label}: the skill is gone", judged(skill, FORGOTTEN), evidence)

@@ -111,13 +111,13 @@ def variant_table(variants: Mapping[str, Any], theirs: Mapping[str, Any]) -> str
 
 
 def _cells(group: Mapping[str, Any]) -> list[str]:
-    success, tracking, alive = (_within(group.get(metric), 0.0, 1.0) for metric in METRICS[:3])
+    success, tracking, alive = (within(group.get(metric), 0.0, 1.0) for metric in METRICS[:3])
     n = next((estimate["n"] for estimate in group.values() if estimate["n"]), "")
     steps = number(group.get("episode_length"), 0)
     return [str(n), percent(success), number(tracking, 2), number(alive, 2), steps, percent(group.get("skill"))]
 
 
-def _within(estimate: Mapping[str, Any] | None, low: float, high: float) -> Any:
+def within(estimate: Mapping[str, Any] | None, low: float, high: float) -> Any:
     """An estimate whose interval does not leave what the number can be."""
     if estimate is None or "low" not in estimate:
         return estimate

@@ -10,7 +10,6 @@ import mujoco
 import numpy as np
 from scipy.optimize import nnls
 
-from forgetmimic_jax.motion.contact import FloorPoints, floor_positions
 from forgetmimic_jax.motion.least_squares import Term
 from forgetmimic_jax.motion.timeline import Timeline, cross_matrix
 from forgetmimic_jax.robot import Robot
@@ -76,12 +75,12 @@ def floor_wrench(
     )
 
 
-def missing_acceleration(robot: Robot, floor: FloorPoints, qpos: np.ndarray, fps: float) -> np.ndarray:
+def missing_acceleration(robot: Robot, points: np.ndarray, qpos: np.ndarray, fps: float) -> np.ndarray:
     """What a motion needs and the floor cannot give, per unit of mass: [frame - 2, 6] m/s^2 as in `floor_wrench`.
 
     Args:
         robot: the robot.
-        floor: its points that can touch the floor.
+        points: [frame, point, 3] m that can touch the floor.
         qpos: [frame, nq].
         fps: frames per s.
     """
@@ -95,9 +94,9 @@ def missing_acceleration(robot: Robot, floor: FloorPoints, qpos: np.ndarray, fps
         mujoco.mj_angmomMat(model, data, momentum[frame], 1)
     timeline = Timeline(len(qpos), None)
     change, _, _ = timeline.changes(qpos)
-    points, none = floor_positions(robot, floor, qpos), np.zeros(len(qpos), bool)
+    flight = np.zeros(len(qpos), bool)  # whatever is low enough may push
     rate = fps**2 / (float(model.body_subtreemass[1]) * RADIUS)
-    return _missing(timeline, change, com, _between(timeline, momentum), points, none, rate, fps)[0]
+    return _missing(timeline, change, com, _between(timeline, momentum), points, flight, rate, fps)[0]
 
 
 def _between(timeline: Timeline, momentum: np.ndarray) -> np.ndarray:

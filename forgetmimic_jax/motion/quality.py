@@ -105,7 +105,7 @@ def measure(robot: Robot, clip: Clip, cycle_frames: int | None = None) -> Qualit
         jitter=_jitter(joint_vel, clip.fps),
         seam=None if cycle_frames is None else seam_ratio(joint_vel, cycle_frames),
         flight_acceleration=_flight_acceleration(robot, qpos, height.min(axis=1), clip.fps),
-        missing_acceleration=_worst(missing_acceleration(robot, points, qpos, clip.fps), clip.fps),
+        missing_acceleration=_worst(missing_acceleration(robot, positions, qpos, clip.fps), clip.fps),
     )
 
 
