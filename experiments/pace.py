@@ -35,7 +35,8 @@ TRIALS = {
 
 TEXT = """# Unlearning's pace on a laptop
 
-λ = 16 on the shipped G1 base, seed 0 where no other is named, 20 episodes a clip; intervals over the episodes.
+λ = 16 on the G1 base of 33.5 M steps and its clips, both since replaced ([base_policy.md](base_policy.md)); seed 0
+where no other is named, 20 episodes a clip; intervals over the episodes.
 `python experiments/pace.py` writes this page from `results/pace/`.
 
 {table}

@@ -68,9 +68,9 @@ class Retarget:
 
 @dataclass
 class Check:
-    """Measure every clip against the bar: floor contact, joint limits, smoothness, seams, flight. Exit code 2 if one
-    fails. Without a bar: *missing*, the acceleration that no contact gives in the worst 0.2 s. Clips with much of it
-    are not learned (experiments/base_policy.md)."""
+    """Measure every clip against the bar: floor contact, joint limits, smoothness, seams, flight, and what it asks for
+    that is not there: acceleration that no contact gives in the worst 0.2 s (*missing*), torque in the worst 0.1 s
+    (*torque*, of the motor's limit). Exit code 2 if one fails."""
 
     library: Path | None = None
     """Folder of clips; data/ROBOT by default."""
@@ -270,6 +270,7 @@ COLUMNS = {  # of the table: title, unit, and how a Quality's field is printed
     "seam": ("seam", "x", "{:.2f}", 1.0),
     "flight_acceleration": ("flight", "m/s2", "{:.1f}", 1.0),
     "missing_acceleration": ("missing", "m/s2", "{:.1f}", 1.0),
+    "motor_load": ("torque", "%", "{:.0f}", 100.0),
 }
 
 

@@ -15,7 +15,10 @@ SIDES = ("left", "right")
 # A recorded sole in stance drifts up to 5 cm off the floor and creeps; between the two values the weight falls to 0.
 SOLE_HEIGHT = (0.05, 0.09)  # m
 OTHER_HEIGHT = (0.03, 0.08)  # m, of the other parts' surfaces
-CONTACT_SPEED = (0.3, 0.6)  # m/s
+CONTACT_SPEED = (0.3, 0.6)  # m/s, above which a part slips
+# A low sole pivots and drifts in the recording while it carries the body (in a crouch, in a turn); a swing is faster.
+SWING_SPEED = (1.2, 2.4)  # m/s
+SLIDING = 0.5  # of the weight against slipping, for a low sole that slips in the recording
 # Soles carry and must hold exactly; hands carry at times; what else touches the floor does so roughly.
 SOLE_WEIGHT, HAND_WEIGHT, OTHER_WEIGHT = 1.0, 0.5, 0.2
 FLIGHT_CLEARANCE = 0.06  # m: with every part above it the human touches nothing
@@ -30,25 +33,28 @@ HAND_RADIUS, KNEE_RADIUS, ELBOW_RADIUS = 0.04, 0.05, 0.045
 class HumanContact:
     """Contacts and flight of a human motion."""
 
-    planted: dict[str, np.ndarray]  # by part, [frame]: 0 free to 1 planted
+    down: dict[str, np.ndarray]  # by part, [frame]: 0 free to 1 on the floor
+    planted: dict[str, np.ndarray]  # the same where it does not slip either
     lifted: dict[str, np.ndarray]  # by part of the soles, [frame]: 1 where it moves too fast to touch the floor
     flight: np.ndarray  # bool[frame]
 
 
 def human_contact(pose: HumanPose, fps: float) -> HumanContact:
     """Read contacts from the height and speed of the body's parts; flight from nothing being near the floor."""
-    planted, lifted, heights = {}, {}, []
+    down, planted, lifted, heights = {}, {}, {}, []
     for part, (point, radius) in _human_parts(pose).items():
         speed = np.linalg.norm(rate(point, fps), axis=-1)
         height = point[:, 2] - radius
         sole = part.endswith(("toe", "heel"))
         weight = SOLE_WEIGHT if sole else HAND_WEIGHT if part.endswith("hand") else OTHER_WEIGHT
-        near = _fade(height, SOLE_HEIGHT if sole else OTHER_HEIGHT)
-        planted[part] = weight * near * _fade(speed, CONTACT_SPEED)
+        near = weight * _fade(height, SOLE_HEIGHT if sole else OTHER_HEIGHT)
+        planted[part] = down[part] = near * _fade(speed, CONTACT_SPEED)
         if sole:
-            lifted[part] = 1.0 - _fade(speed, CONTACT_SPEED)
+            down[part] = near * _fade(speed, SWING_SPEED)
+            planted[part] = SLIDING * down[part] + (1 - SLIDING) * planted[part]
+            lifted[part] = 1.0 - _fade(speed, SWING_SPEED)
         heights.append(height)
-    return HumanContact(planted, lifted, np.min(heights, axis=0) > FLIGHT_CLEARANCE)
+    return HumanContact(down, planted, lifted, np.min(heights, axis=0) > FLIGHT_CLEARANCE)
 
 
 def _human_parts(pose: HumanPose) -> dict[str, tuple[np.ndarray, float]]:

@@ -17,8 +17,9 @@ from forgetmimic_jax.robot import Robot
 RADIUS = 0.3  # m, over which a moment counts as a force
 FRICTION = 0.7
 TOUCHING = 0.02  # m above the floor
-SURE = 3.0  # m/s^2: beyond it a missing acceleration counts linearly, so that an impact does not bend the motion
+SURE = 20.0  # m/s^2: beyond it a missing acceleration counts linearly, so that an impact does not bend the motion
 GRAVITY = np.array([0.0, 0.0, -9.81])
+PYRAMID = np.array([[FRICTION, 0, 1], [-FRICTION, 0, 1], [0, FRICTION, 1], [0, -FRICTION, 1]])  # its edges
 
 
 def floor_wrench(
@@ -136,12 +137,11 @@ def floor_answer(needed: np.ndarray, levers: np.ndarray, touching: np.ndarray) -
 
     levers [row, point, 3] m: the points from the centre of mass; touching bool[row, point].
     """
-    edges = np.array([[FRICTION, 0, 1], [-FRICTION, 0, 1], [0, FRICTION, 1], [0, -FRICTION, 1]])
     given = np.zeros_like(needed)
     project = np.tile(np.eye(6), (len(needed), 1, 1))
     for row in np.flatnonzero(touching.any(axis=1)):
-        arms = np.repeat(levers[row, touching[row]], len(edges), axis=0)
-        forces = np.tile(edges, (len(arms) // len(edges), 1))
+        arms = np.repeat(levers[row, touching[row]], len(PYRAMID), axis=0)
+        forces = np.tile(PYRAMID, (len(arms) // len(PYRAMID), 1))
         columns = np.concatenate([forces, np.cross(arms, forces) / RADIUS], axis=1).T
         share, _ = nnls(columns, needed[row])
         given[row] = columns @ share

@@ -24,8 +24,8 @@ def gauss_newton(
     nv: int,
     cyclic: bool,
     iterations: int,
-) -> np.ndarray:
-    """Lower the sum of squared residuals of qpos [frame, nq] by damped Gauss-Newton steps.
+) -> tuple[np.ndarray, float]:
+    """Lower the sum of squared residuals of qpos [frame, nq] by damped Gauss-Newton steps; where it got, and the sum.
 
     Args:
         terms_of: the residuals at a qpos.
@@ -49,7 +49,7 @@ def gauss_newton(
                 break
         else:
             damping *= 8.0
-    return qpos
+    return qpos, cost
 
 
 def gauss_newton_step(terms: list[Term], frames: int, nv: int, cyclic: bool, damping: float) -> np.ndarray:

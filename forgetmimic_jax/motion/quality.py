@@ -12,6 +12,7 @@ from forgetmimic_jax.motion.clip import Clip
 from forgetmimic_jax.motion.contact import SIDES, FloorPoints, floor_points, floor_positions
 from forgetmimic_jax.motion.dynamics import missing_acceleration
 from forgetmimic_jax.motion.kinematics import configuration, rate
+from forgetmimic_jax.motion.motors import motor_loads
 from forgetmimic_jax.robot import Robot
 
 STANCE_HEIGHT = 0.05  # m: a foot this low …
@@ -20,6 +21,7 @@ TOUCHING = 0.01  # m: a sole point this low touches the floor
 FLIGHT_CLEARANCE = 0.02  # m: with every point above it the robot flies
 FLIGHT_FRAMES = 5  # shorter hops hold no acceleration worth reading
 MISSING_SECONDS = 0.2  # a single frame's acceleration says little
+LOAD_SECONDS = 0.1  # … nor does its torque
 JITTER_HZ = 12.0  # a body's own motion is slower
 
 # The bar a clip has to pass.
@@ -29,6 +31,8 @@ MAX_SKATE = 0.10  # m/s
 MAX_SEAM_RATIO = 1.0
 MAX_JITTER = 0.02
 MAX_FLIGHT_ERROR = 5.0  # m/s^2 from gravity
+MAX_MISSING = 3.5  # m/s^2
+MAX_LOAD = 1.5  # torque limits
 
 
 @dataclass(frozen=True)
@@ -48,6 +52,7 @@ class Quality:
     seam: float | None  # velocity jump where cycles meet, over the largest change elsewhere; cyclic clips
     flight_acceleration: float | None  # m/s^2, vertical, of the centre of mass, median of flight
     missing_acceleration: float | None  # m/s^2 that no contact gives, the worst mean over MISSING_SECONDS
+    motor_load: float | None  # torque over torque limit, the worst motor's worst mean over LOAD_SECONDS, without wrists
 
     def failures(self) -> list[str]:
         """What misses the bar, in words; empty where the clip passes."""
@@ -73,6 +78,12 @@ class Quality:
                     f"off the floor it accelerates at {self.flight_acceleration:.1f} m/s^2 upwards, not -9.8",
                 )
             )
+        if self.missing_acceleration is not None:
+            missing = f"for {MISSING_SECONDS} s it needs {self.missing_acceleration:.1f} m/s^2 that no contact gives"
+            checks.append((self.missing_acceleration > MAX_MISSING, missing))
+        if self.motor_load is not None:
+            load = f"for {LOAD_SECONDS} s it needs {self.motor_load:.2f} times a motor's torque limit"
+            checks.append((self.motor_load > MAX_LOAD, load))
         return [words for failed, words in checks if failed]
 
 
@@ -92,6 +103,8 @@ def measure(robot: Robot, clip: Clip, cycle_frames: int | None = None) -> Qualit
     joint_vel = np.diff(joints, axis=0) * clip.fps
     acceleration = np.abs(np.diff(joint_vel, axis=0)) * clip.fps
     beyond = np.maximum(joints - robot.joint_upper, robot.joint_lower - joints)
+    missing = _means(missing_acceleration(robot, positions, qpos, clip.fps), MISSING_SECONDS, clip.fps)
+    loads = _means(motor_loads(robot, points, qpos, clip.fps), LOAD_SECONDS, clip.fps)
     return Quality(
         name=clip.name,
         seconds=clip.seconds,
@@ -105,7 +118,8 @@ def measure(robot: Robot, clip: Clip, cycle_frames: int | None = None) -> Qualit
         jitter=_jitter(joint_vel, clip.fps),
         seam=None if cycle_frames is None else seam_ratio(joint_vel, cycle_frames),
         flight_acceleration=_flight_acceleration(robot, qpos, height.min(axis=1), clip.fps),
-        missing_acceleration=_worst(missing_acceleration(robot, positions, qpos, clip.fps), clip.fps),
+        missing_acceleration=None if missing is None else float(np.linalg.norm(missing, axis=-1).max()),
+        motor_load=None if loads is None else float(np.abs(loads).max()),
     )
 
 
@@ -123,13 +137,10 @@ def seam_ratio(joint_vel: np.ndarray, cycle_frames: int) -> float | None:
     return float(change[at_seam].max() / max(change[~at_seam].max(), 1e-9))
 
 
-def _worst(missing: np.ndarray, fps: float) -> float | None:
-    """Largest length of the mean over MISSING_SECONDS; None for a shorter clip."""
-    window = round(MISSING_SECONDS * fps)
-    if len(missing) < window:
-        return None
-    means = sliding_window_view(missing, window, axis=0).mean(axis=-1)
-    return float(np.linalg.norm(means, axis=-1).max())
+def _means(rows: np.ndarray, seconds: float, fps: float) -> np.ndarray | None:
+    """Means of [row, n] over windows of `seconds`; None for a shorter clip."""
+    window = round(seconds * fps)
+    return sliding_window_view(rows, window, axis=0).mean(axis=-1) if len(rows) >= window else None
 
 
 def _stance_height(points: FloorPoints, positions: np.ndarray, fps: float) -> float | None:

@@ -7,6 +7,7 @@ frame n is frame 0 moved by the cycle's planar step.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -19,29 +20,37 @@ from forgetmimic_jax.motion.contact import FloorPoints, HumanContact
 from forgetmimic_jax.motion.dynamics import floor_wrench
 from forgetmimic_jax.motion.kinematics import PlanarTransform, rotation
 from forgetmimic_jax.motion.least_squares import Term, gauss_newton
+from forgetmimic_jax.motion.motors import motor_torque
 from forgetmimic_jax.motion.retarget import Targets
 from forgetmimic_jax.motion.timeline import Timeline, cross_matrix
 from forgetmimic_jax.robot import Robot
 
 SEAM_SECONDS = 0.12  # half width of the more smoothed seam
+TORQUE_SHARE = 0.8  # of the motors' limits; the rest is for balance
+GENTLE = 0.25  # of the dynamics' weight, in a first round
 
 
 @dataclass(frozen=True)
 class Weights:
     """Weight of each residual; a residual of 1 over its weight counts as one radian of limb direction."""
 
-    hip_centre: float = 2.0  # per m
+    hip_centre: float = 0.5  # per m
     posture: float = 0.03  # per rad from the default pose
     wrist_posture: float = 0.2  # the same for the wrists, which the human skeleton lacks
-    stance_height: float = 40.0  # per m of a planted sole point off the floor
+    stance_height: float = 40.0  # per m that a sole point which is down is off the floor
     stance_slip: float = 150.0  # per m a planted sole point moves in one frame
     floor: float = 60.0  # per m below the floor, or below the clearance of a sole that swings
-    wrench: float = 0.05  # per m/s^2 of acceleration that the floor cannot provide
+    wrench: float = 0.2  # per m/s^2 of acceleration that the floor cannot provide
+    torque: float = 3.0  # per torque limit that a motor lacks
     limit: float = 20.0  # per rad beyond the joint's limit less its margin
     speed: float = 0.3  # per rad/s beyond the share of the motor's speed
     smooth_hz: float = 6.0  # jerk is weighed so that motion faster than this is smoothed away
     seam: float = 5.0  # times more where cycles meet, since a recording may stop one motion there and start another
     clearance: float = 0.02  # m that a swinging sole keeps above the floor
+
+    def with_dynamics(self, share: float) -> Weights:
+        """The same with a share of what the dynamics weigh."""
+        return dataclasses.replace(self, wrench=share * self.wrench, torque=share * self.torque)
 
 
 class Pose(NamedTuple):
@@ -68,7 +77,7 @@ def refine(
     weights: Weights | None = None,
     limit_margin: float = 0.02,
     speed_share: float = 0.8,
-    iterations: int = 25,
+    iterations: int = 150,
 ) -> np.ndarray:
     """Improve qpos [frame, 7 + joint].
 
@@ -83,12 +92,23 @@ def refine(
         weights: of the residuals.
         limit_margin: rad kept from every joint's limit.
         speed_share: of the motors' speed that the joints may use.
-        iterations: Gauss-Newton steps.
+        iterations: Gauss-Newton steps a round.
     """
     timeline = Timeline(len(qpos), step)
-    problem = _Problem(robot, targets, contact, floor, fps, timeline, weights or Weights(), limit_margin, speed_share)
-    qpos = gauss_newton(problem.terms, problem.moved, qpos, robot.model.nv, timeline.cyclic, iterations)
-    return np.concatenate([qpos[:, :7], np.clip(qpos[:, 7:], *problem.bounds)], axis=-1)
+    weights = weights or Weights()
+
+    gentle, strict = (
+        _Problem(robot, targets, contact, floor, fps, timeline, given, limit_margin, speed_share)
+        for given in (weights.with_dynamics(GENTLE), weights)
+    )
+
+    def solved(problem: _Problem, start: np.ndarray) -> tuple[np.ndarray, float]:
+        return gauss_newton(problem.terms, problem.moved, start, robot.model.nv, timeline.cyclic, iterations)
+
+    # What the floor answers has kinks, in which the search may stick. Which way around them is better depends on the
+    # clip: at once, or from a motion that the dynamics bent less.
+    best, _ = min((solved(strict, start) for start in (qpos, solved(gentle, qpos)[0])), key=lambda found: found[1])
+    return np.concatenate([best[:, :7], np.clip(best[:, 7:], *strict.bounds)], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -123,22 +143,10 @@ class _Problem:
     def terms(self, qpos: np.ndarray) -> list[Term]:
         """Every residual at qpos."""
         pose = self.pose(qpos)
-        wrench = floor_wrench(
-            self.timeline,
-            qpos,
-            pose.com,
-            pose.com_jac,
-            pose.momentum,
-            pose.points[:, self.robot.model.nbody :],
-            self.contact.flight,
-            float(self.robot.model.body_subtreemass[1]),
-            self.fps,
-            self.weights.wrench,
-        )
         return [
             *self.imitation(qpos, pose),
             *self.contacts(pose),
-            wrench,
+            *self.dynamics(qpos, pose),
             *self.joint_bounds(qpos),
             *self.smoothness(qpos),
         ]
@@ -211,10 +219,12 @@ class _Problem:
         every = np.arange(self.frames)
         pos, jac = pose.points[:, bodies:], pose.points_jac[:, bodies:]
         height = pos[..., 2]
-        planted, lifted = self._by_point(self.contact.planted), self._by_point(self.contact.lifted)
+        down, planted, lifted = (
+            self._by_point(parts) for parts in (self.contact.down, self.contact.planted, self.contact.lifted)
+        )
 
-        touched = planted.any(axis=0)
-        hold = self.weights.stance_height * planted[:, touched]
+        touched = down.any(axis=0)
+        hold = self.weights.stance_height * down[:, touched]
         yield Term(every, hold * height[:, touched], {0: hold[..., None] * jac[:, touched, 2]})
         short = height - self.weights.clearance * lifted
         under = self.weights.floor * (short < 0.0)
@@ -232,6 +242,33 @@ class _Problem:
                 0: (-hold[..., None] * jac[here]).reshape(*rows, self.robot.model.nv),
                 1: (hold[..., None] * jac_ahead).reshape(*rows, self.robot.model.nv),
             },
+        )
+
+    def dynamics(self, qpos: np.ndarray, pose: Pose) -> Iterator[Term]:
+        """What neither the floor nor the motors can give."""
+        points = slice(self.robot.model.nbody, None)
+        yield floor_wrench(
+            self.timeline,
+            qpos,
+            pose.com,
+            pose.com_jac,
+            pose.momentum,
+            pose.points[:, points],
+            self.contact.flight,
+            float(self.robot.model.body_subtreemass[1]),
+            self.fps,
+            self.weights.wrench,
+        )
+        yield motor_torque(
+            self.robot,
+            self.timeline,
+            qpos,
+            pose.points[:, points],
+            pose.points_jac[:, points],
+            self.contact.flight,
+            self.fps,
+            TORQUE_SHARE,
+            self.weights.torque,
         )
 
     def joint_bounds(self, qpos: np.ndarray) -> Iterator[Term]:

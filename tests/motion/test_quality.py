@@ -74,6 +74,7 @@ def test_flight_falls_with_gravity(robot, standing):
     assert any("-2.0 m/s^2" in failure for failure in slow.failures())
     assert hop(9.81, 0.4).missing_acceleration == pytest.approx(0.0, abs=1e-6)
     assert slow.missing_acceleration == pytest.approx(9.81 - 2.0, abs=0.01)
+    assert any("for 0.2 s it needs 7.8 m/s^2" in failure for failure in slow.failures())
 
 
 def test_a_push_the_floor_cannot_give(robot, standing):
@@ -82,6 +83,21 @@ def test_a_push_the_floor_cannot_give(robot, standing):
     shove = quality.measure(robot, moved(standing, 0.5 * 9.81 * time[:, None] ** 2 * [0.0, 1.0, 0.0]))
     assert shove.missing_acceleration > 0.3 * 9.81
     assert quality.measure(robot, dataclasses.replace(standing, **_first(standing, 8))).missing_acceleration is None
+
+
+def test_a_motor_beyond_its_limit(robot, standing):
+    """Both arms flung up and down at 3 Hz through 2 rad: more than a shoulder gives; at 0.3 Hz it is little."""
+
+    def flung(hertz):
+        joints = standing.joint_pos.copy()
+        shoulders = ["shoulder_pitch" in name for name in robot.joint_names]
+        joints[:, shoulders] += np.sin(2 * np.pi * hertz * np.arange(100) / 50.0)[:, None]
+        return quality.measure(robot, dataclasses.replace(standing, joint_pos=joints))
+
+    assert flung(0.3).motor_load < 0.5
+    assert flung(3.0).motor_load > quality.MAX_LOAD
+    assert any("times a motor's torque limit" in failure for failure in flung(3.0).failures())
+    assert quality.measure(robot, dataclasses.replace(standing, **_first(standing, 6))).motor_load is None
 
 
 def _first(clip, frames):

@@ -13,6 +13,7 @@ from forgetmimic_jax.motion.deepmimic import LEG_LENGTH, forward_kinematics, rea
 from forgetmimic_jax.motion.dynamics import FRICTION, RADIUS, floor_answer, floor_wrench
 from forgetmimic_jax.motion.kinematics import PlanarTransform, generalized_velocity, heading
 from forgetmimic_jax.motion.least_squares import Term, gauss_newton_step
+from forgetmimic_jax.motion.motors import InverseDynamics, motor_loads, motor_torque, strong
 from forgetmimic_jax.motion.refine import Weights, _Problem, refine
 from forgetmimic_jax.motion.retarget import inverse_kinematics, leg_scale, make_targets
 from forgetmimic_jax.motion.timeline import Timeline
@@ -68,9 +69,10 @@ def test_jacobians_are_the_residuals_slopes(robot, tmp_path, loop):
         )
         if not np.any(slope):
             continue
-        # Orientation errors of some 0.1 rad and the momentum matrix are linearised, the rest is exact.
+        # Orientation errors of some 0.1 rad and the momentum matrix are linearised, and the weight of what the floor
+        # and the motors lack is held; the rest is exact.
         exact = np.linalg.norm(found - slope) / np.linalg.norm(slope)
-        assert exact < (0.5 if term.residual.shape[1] == 6 else 0.1)
+        assert exact < (0.5 if set(term.jacobians) == {0, 1, 2} else 0.1)
         checked += exact < 1e-4
     assert checked >= 15
 
@@ -136,15 +138,20 @@ def wrench_of(robot, qpos, *, flight):
     ), pose
 
 
-def test_free_fall_and_standing_need_nothing(robot):
-    time = np.arange(10) / FPS
-    qpos = np.zeros((10, robot.model.nq))
+def standing(robot, frames):
+    """qpos [frame, nq] of the default pose with its soles on the floor."""
+    qpos = np.zeros((frames, robot.model.nq))
     qpos[:, 3] = 1.0
     qpos[:, 7:] = np.asarray(robot.arrays.default_joint_pos)
     points = floor_points(robot)
     qpos[:, 2] -= floor_positions(robot, points, qpos)[:, points.is_sole, 2].min()
-    standing, _ = wrench_of(robot, qpos, flight=False)
-    np.testing.assert_allclose(standing.residual, 0.0, atol=1e-9)
+    return qpos
+
+
+def test_free_fall_and_standing_need_nothing(robot):
+    time = np.arange(10) / FPS
+    qpos = standing(robot, 10)
+    np.testing.assert_allclose(wrench_of(robot, qpos, flight=False)[0].residual, 0.0, atol=1e-9)
     assert np.abs(wrench_of(robot, qpos, flight=True)[0].residual).max() > 1e-3  # nothing holds it up
     qpos[:, 0] += 1.5 * time
     qpos[:, 2] += 0.5 + 2.0 * time - 0.5 * 9.81 * time**2
@@ -184,6 +191,104 @@ def wrench_scale(robot, qpos):
         mujoco.mj_comPos(robot.model, data)
         heights.append(data.subtree_com[1][2])
     return (np.diff(heights, n=2) * FPS**2 + 9.81)[:, None]
+
+
+def test_a_held_arm_weighs_on_the_motors_above_it(robot):
+    """By lever and weight: a motor that holds a body up in stance gives -axis . (lever x m g) of all beyond it."""
+    qpos = standing(robot, 6)
+    qpos[:, 7:] += np.where(strong(robot), 0.3, 0.0) * np.array(["arm" not in name for name in robot.joint_names])
+    qpos[:, 7:][:, ["shoulder_pitch" in name for name in robot.joint_names]] -= 1.2
+    loads = motor_loads(robot, floor_points(robot), qpos, FPS)
+    data = mujoco.MjData(robot.model)
+    data.qpos[:] = qpos[0]
+    mujoco.mj_kinematics(robot.model, data)
+    mujoco.mj_comPos(robot.model, data)
+    names = [name for name, counts in zip(robot.joint_names, strong(robot), strict=True) if counts]
+    checked = 0
+    for column, name in enumerate(names):
+        if not any(part in name for part in ("shoulder", "elbow", "waist")):
+            continue  # a leg's share is the floor's choice
+        joint = robot.model.joint(name)
+        body = int(robot.model.jnt_bodyid[joint.id])
+        weight = robot.model.body_subtreemass[body] * np.array([0.0, 0.0, -9.81])
+        torque = -data.xaxis[joint.id] @ np.cross(data.subtree_com[body] - data.xanchor[joint.id], weight)
+        effort = float(robot.arrays.effort[robot.joint_names.index(name)])
+        np.testing.assert_allclose(loads[:, column], torque / effort, atol=1e-4)
+        checked += abs(torque) > 0.5
+    assert checked >= 5
+
+
+def test_the_motors_jacobian_is_the_lacks_slope(robot):
+    """In the air, turning and waving, by central differences; little is lacking, so the robust weight hardly moves."""
+    rng = np.random.default_rng(4)
+    time = np.arange(8)[:, None] / FPS
+    wave = 0.4 * np.sin(12.0 * time + rng.normal(size=(1, robot.num_joints)))
+    turns = Rotation.from_rotvec(time * [0.3, 1.0, 0.5]).as_quat(scalar_first=True)
+    qpos = np.concatenate([np.tile([0.0, 0.0, 2.0], (8, 1)), turns, wave], axis=1)
+    problem = _Problem(robot, None, None, floor_points(robot), FPS, Timeline(8, None), Weights(), 0.02, 0.8)
+    points = slice(robot.model.nbody, None)
+    share = 0.9 * np.abs(motor_loads(robot, problem.floor, qpos, FPS)).max()
+
+    def term(moved):
+        pose = problem.pose(moved)
+        given = (moved, pose.points[:, points], pose.points_jac[:, points], np.ones(8, bool), FPS)
+        return motor_torque(robot, problem.timeline, *given, share, 1.0)
+
+    direction = rng.normal(size=(8, robot.model.nv))
+    here, size = term(qpos), 1e-7
+    plus, minus = (term(problem.moved(qpos, sign * size * direction)).residual for sign in (1.0, -1.0))
+    found = sum(np.einsum("tmi,ti->tm", jac, direction[here.frame + ahead]) for ahead, jac in here.jacobians.items())
+    slope = (plus - minus) / (2.0 * size)
+    assert np.linalg.norm(slope) > 1.0
+    assert np.linalg.norm(found - slope) < 0.05 * np.linalg.norm(slope)
+
+
+def test_falling_freely_needs_no_motor(robot):
+    time = np.arange(10) / FPS
+    qpos = standing(robot, 10)
+    qpos[:, 2] += 1.0 + 2.0 * time - 0.5 * 9.81 * time**2
+    np.testing.assert_allclose(motor_loads(robot, floor_points(robot), qpos, FPS), 0.0, atol=1e-6)
+
+
+def test_standing_legs_carry_the_robot(robot):
+    """What the floor pushes reaches the root through the legs: both alike, and far from their limits."""
+    loads = motor_loads(robot, floor_points(robot), standing(robot, 6), FPS)
+    names = [name for name, counts in zip(robot.joint_names, strong(robot), strict=True) if counts]
+    knees = loads[:, ["knee" in name for name in names]]
+    np.testing.assert_allclose(knees[:, 0], knees[:, 1], atol=1e-3)
+    assert 0.02 < np.abs(loads).max() < 0.5
+
+
+def test_inverse_dynamics_undo_mujocos_own(robot):
+    """The acceleration that forward dynamics gives to a force asks for that force again."""
+    rng = np.random.default_rng(3)
+    inverse, data = InverseDynamics(robot), mujoco.MjData(robot.model)
+    data.qpos[:] = standing(robot, 1)[0]
+    data.qpos[2] += 2.0
+    data.qvel[:] = rng.normal(size=robot.model.nv)
+    data.ctrl[:] = 0.0
+    mujoco.mj_forward(robot.model, data)
+    found = inverse.force(data.qpos, data.qvel, data.qacc)
+    np.testing.assert_allclose(found, data.qfrc_actuator + data.qfrc_passive, atol=1e-8)
+
+
+def test_a_motor_counts_beyond_its_share(robot):
+    """The residual is what the load has over the share, and a share that no load reaches leaves nothing."""
+    qpos = standing(robot, 6)
+    problem = _Problem(robot, None, None, floor_points(robot), FPS, Timeline(6, None), Weights(), 0.02, 0.8)
+    pose, points = problem.pose(qpos), slice(robot.model.nbody, None)
+    loads = np.zeros((4, robot.num_joints))
+    loads[:, strong(robot)] = motor_loads(robot, problem.floor, qpos, FPS)
+
+    def lack(share):
+        given = (qpos, pose.points[:, points], pose.points_jac[:, points], np.zeros(6, bool), FPS)
+        return motor_torque(robot, problem.timeline, *given, share, 1e-3).residual / 1e-3
+
+    np.testing.assert_allclose(lack(1.0), 0.0)
+    share = 0.5 * np.abs(loads).max()
+    expected = np.sign(loads) * np.maximum(np.abs(loads) - share, 0.0)
+    robust = (1.0 + np.sum(expected**2, axis=-1, keepdims=True)) ** -0.25
+    np.testing.assert_allclose(lack(share), robust * expected, atol=1e-6)
 
 
 def test_contacts_of_a_human_who_stands_floats_and_lies(tmp_path):
