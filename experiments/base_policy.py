@@ -159,6 +159,7 @@ def turned() -> dict[str, float]:
 
 
 def _earlier() -> dict[str, Any]:
+    """By clip: `quality.measure` and the base's evaluation, both at the commit it names."""
     return json.loads((RESULTS / "earlier_library.json").read_text())
 
 
