@@ -59,7 +59,6 @@ def floor_wrench(
     jac_1, jac_2 = (timeline.vectors(com_jac, first, ahead) for ahead in (1, 2))
     rate = fps**2 / (mass * RADIUS)
     missing, given, project = _missing(timeline, change, com, between, points, flight, rate, fps)
-    robust = weight * (1.0 + np.sum(missing**2, axis=-1) / SURE**2) ** -0.25
     lever = -cross_matrix(given[:, :3]) / RADIUS @ jac_1
     blocks = {
         0: (fps**2 * com_jac[first], -rate * between[first] @ before[first]),
@@ -69,11 +68,8 @@ def floor_wrench(
         ),
         2: (fps**2 * jac_2, rate * between_second @ after[second]),
     }
-    return Term(
-        first,
-        robust[:, None] * missing,
-        {offset: robust[:, None, None] * (project @ np.concatenate(block, axis=1)) for offset, block in blocks.items()},
-    )
+    jacobians = {offset: project @ np.concatenate(block, axis=1) for offset, block in blocks.items()}
+    return Term(first, missing, jacobians).softened(weight, SURE)
 
 
 def missing_acceleration(robot: Robot, points: np.ndarray, qpos: np.ndarray, fps: float) -> np.ndarray:

@@ -16,6 +16,12 @@ class Term(NamedTuple):
     residual: np.ndarray
     jacobians: dict[int, np.ndarray]
 
+    def softened(self, weight: float, sure: float) -> Term:
+        """The term times `weight`; a row longer than about `sure` counts linearly instead of squared."""
+        row = weight * (1.0 + np.sum(self.residual**2, axis=-1) / sure**2) ** -0.25
+        jacobians = {offset: row[:, None, None] * jacobian for offset, jacobian in self.jacobians.items()}
+        return Term(self.frame, row[:, None] * self.residual, jacobians)
+
 
 def gauss_newton(
     terms_of: Callable[[np.ndarray], list[Term]],

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from scipy.optimize import nnls
 
-from forgetmimic_jax.motion.contact import FloorPoints, floor_positions
+from forgetmimic_jax.motion.contact import FloorPoints
 from forgetmimic_jax.motion.dynamics import PYRAMID, RADIUS, TOUCHING
 from forgetmimic_jax.motion.least_squares import Term
 from forgetmimic_jax.motion.timeline import Timeline
@@ -59,7 +59,7 @@ def motor_torque(
     first, _ = timeline.having(2)
     second = (first + 1) % timeline.frames
     velocity, acceleration = _rates(change[first], change[second], fps)
-    inverse, counted = InverseDynamics(robot), strong(robot)
+    inverse, counted = InverseDynamics(robot), ~wrists(robot)
     lack = np.zeros((len(first), robot.num_joints))
     position, speed, rate = (np.zeros((*lack.shape, robot.model.nv)) for _ in range(3))
     for row, frame in enumerate(second):
@@ -76,37 +76,32 @@ def motor_torque(
         1: position + speed @ (after[first] + before[second]) + rate @ (before[second] - after[first]),
         2: (speed + rate) @ after[second],
     }
-    robust = weight * (1.0 + np.sum(lack**2, axis=-1) / SURE**2) ** -0.25
-    return Term(
-        first,
-        robust[:, None] * lack,
-        {offset: robust[:, None, None] * block for offset, block in blocks.items()},
-    )
+    return Term(first, lack, blocks).softened(weight, SURE)
 
 
-def motor_loads(robot: Robot, points: FloorPoints, qpos: np.ndarray, fps: float) -> np.ndarray:
-    """Torque over torque limit of every motor but the wrists': [frame - 2, joint], signed.
+def motor_loads(robot: Robot, points: FloorPoints, positions: np.ndarray, qpos: np.ndarray, fps: float) -> np.ndarray:
+    """Torque over torque limit of every motor, 0 for the wrists': [frame - 2, joint], signed.
 
     Args:
         robot: the robot.
         points: its points that can touch the floor.
+        positions: of the points [frame, point, 3] m.
         qpos: [frame, nq].
         fps: frames per s.
     """
     change, _, _ = Timeline(len(qpos), None).changes(qpos)
     velocity, acceleration = _rates(change[:-1], change[1:], fps)
-    positions = floor_positions(robot, points, qpos)
     inverse, loads = InverseDynamics(robot), np.zeros((len(velocity), robot.num_joints))
     for row in range(len(loads)):
         force = inverse.force(qpos[row + 1], velocity[row], acceleration[row])
         touching = np.flatnonzero(positions[row + 1, :, 2] < TOUCHING)
         loads[row] = answered(robot, force, inverse.jacobians(points, touching)).torque
-    return loads[:, strong(robot)]
+    return np.where(wrists(robot), 0.0, loads)
 
 
-def strong(robot: Robot) -> np.ndarray:
-    """bool[joint]: the motors that count. A wrist that gives way moves nothing else, and a handstand overloads it."""
-    return np.array(["wrist" not in joint for joint in robot.joint_names])
+def wrists(robot: Robot) -> np.ndarray:
+    """bool[joint]: motors that do not count. A wrist that gives way moves nothing else; a handstand overloads it."""
+    return np.array(["wrist" in joint for joint in robot.joint_names])
 
 
 def answered(robot: Robot, force: np.ndarray, jacobians: np.ndarray) -> Load:

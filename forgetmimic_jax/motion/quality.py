@@ -104,7 +104,7 @@ def measure(robot: Robot, clip: Clip, cycle_frames: int | None = None) -> Qualit
     acceleration = np.abs(np.diff(joint_vel, axis=0)) * clip.fps
     beyond = np.maximum(joints - robot.joint_upper, robot.joint_lower - joints)
     missing = _means(missing_acceleration(robot, positions, qpos, clip.fps), MISSING_SECONDS, clip.fps)
-    loads = _means(motor_loads(robot, points, qpos, clip.fps), LOAD_SECONDS, clip.fps)
+    loads = _means(motor_loads(robot, points, positions, qpos, clip.fps), LOAD_SECONDS, clip.fps)
     return Quality(
         name=clip.name,
         seconds=clip.seconds,

@@ -20,7 +20,7 @@ from forgetmimic_jax.motion.contact import FloorPoints, HumanContact
 from forgetmimic_jax.motion.dynamics import floor_wrench
 from forgetmimic_jax.motion.kinematics import PlanarTransform, rotation
 from forgetmimic_jax.motion.least_squares import Term, gauss_newton
-from forgetmimic_jax.motion.motors import motor_torque
+from forgetmimic_jax.motion.motors import motor_torque, wrists
 from forgetmimic_jax.motion.retarget import Targets
 from forgetmimic_jax.motion.timeline import Timeline, cross_matrix
 from forgetmimic_jax.robot import Robot
@@ -208,8 +208,7 @@ class _Problem:
         error = pose.points[:, hips].mean(axis=1) - self.targets.hip_centre
         yield Term(every, weight * error, {0: weight * pose.points_jac[:, hips].mean(axis=1)})
         default = np.asarray(self.robot.arrays.default_joint_pos, np.float64)
-        wrist = np.array(["wrist" in joint for joint in self.robot.joint_names])
-        pull = np.where(wrist, self.weights.wrist_posture, self.weights.posture)
+        pull = np.where(wrists(self.robot), self.weights.wrist_posture, self.weights.posture)
         rows = np.broadcast_to(pull[:, None] * self._joint_rows(), (self.frames, len(pull), self.robot.model.nv))
         yield Term(every, pull * (qpos[:, 7:] - default), {0: rows})
 

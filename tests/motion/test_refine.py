@@ -13,7 +13,7 @@ from forgetmimic_jax.motion.deepmimic import LEG_LENGTH, forward_kinematics, rea
 from forgetmimic_jax.motion.dynamics import FRICTION, RADIUS, floor_answer, floor_wrench
 from forgetmimic_jax.motion.kinematics import PlanarTransform, generalized_velocity, heading
 from forgetmimic_jax.motion.least_squares import Term, gauss_newton_step
-from forgetmimic_jax.motion.motors import InverseDynamics, motor_loads, motor_torque, strong
+from forgetmimic_jax.motion.motors import InverseDynamics, motor_loads, motor_torque, wrists
 from forgetmimic_jax.motion.refine import Weights, _Problem, refine
 from forgetmimic_jax.motion.retarget import inverse_kinematics, leg_scale, make_targets
 from forgetmimic_jax.motion.timeline import Timeline
@@ -148,6 +148,19 @@ def standing(robot, frames):
     return qpos
 
 
+def tumbling(robot, rng, frames, *, wave, speed):
+    """qpos [frame, nq] in the air, turning, every joint waving by `wave` rad at `speed` rad/s."""
+    time = np.arange(frames)[:, None] / FPS
+    joints = wave * np.sin(speed * time + rng.normal(size=(1, robot.num_joints)))
+    turns = Rotation.from_rotvec(time * [0.3, 1.0, 0.5]).as_quat(scalar_first=True)
+    return np.concatenate([np.tile([0.0, 0.0, 2.0], (frames, 1)), turns, joints], axis=1)
+
+
+def loads_of(robot, qpos):
+    points = floor_points(robot)
+    return motor_loads(robot, points, floor_positions(robot, points, qpos), qpos, FPS)
+
+
 def test_free_fall_and_standing_need_nothing(robot):
     time = np.arange(10) / FPS
     qpos = standing(robot, 10)
@@ -161,11 +174,7 @@ def test_free_fall_and_standing_need_nothing(robot):
 
 def test_the_momentum_is_mujocos(robot):
     """The wrench's moment is the change of mj_subtreeVel's angular momentum."""
-    rng = np.random.default_rng(1)
-    time = np.arange(40)[:, None] / FPS
-    wave = 0.3 * np.sin(3.0 * time + rng.normal(size=(1, robot.num_joints)))
-    turns = Rotation.from_rotvec(time * [0.3, 1.0, 0.5]).as_quat(scalar_first=True)
-    qpos = np.concatenate([np.tile([0.0, 0.0, 2.0], (40, 1)), turns, wave], axis=1)
+    qpos = tumbling(robot, np.random.default_rng(1), 40, wave=0.3, speed=3.0)
     term, _ = wrench_of(robot, qpos, flight=True)
     qvel = generalized_velocity(qpos, FPS)
     data, momentum = mujoco.MjData(robot.model), []
@@ -196,23 +205,22 @@ def wrench_scale(robot, qpos):
 def test_a_held_arm_weighs_on_the_motors_above_it(robot):
     """By lever and weight: a motor that holds a body up in stance gives -axis . (lever x m g) of all beyond it."""
     qpos = standing(robot, 6)
-    qpos[:, 7:] += np.where(strong(robot), 0.3, 0.0) * np.array(["arm" not in name for name in robot.joint_names])
+    qpos[:, 7:] += np.where(wrists(robot), 0.0, 0.3) * np.array(["arm" not in name for name in robot.joint_names])
     qpos[:, 7:][:, ["shoulder_pitch" in name for name in robot.joint_names]] -= 1.2
-    loads = motor_loads(robot, floor_points(robot), qpos, FPS)
+    loads = loads_of(robot, qpos)
     data = mujoco.MjData(robot.model)
     data.qpos[:] = qpos[0]
     mujoco.mj_kinematics(robot.model, data)
     mujoco.mj_comPos(robot.model, data)
-    names = [name for name, counts in zip(robot.joint_names, strong(robot), strict=True) if counts]
     checked = 0
-    for column, name in enumerate(names):
+    for column, name in enumerate(robot.joint_names):
         if not any(part in name for part in ("shoulder", "elbow", "waist")):
             continue  # a leg's share is the floor's choice
         joint = robot.model.joint(name)
         body = int(robot.model.jnt_bodyid[joint.id])
         weight = robot.model.body_subtreemass[body] * np.array([0.0, 0.0, -9.81])
         torque = -data.xaxis[joint.id] @ np.cross(data.subtree_com[body] - data.xanchor[joint.id], weight)
-        effort = float(robot.arrays.effort[robot.joint_names.index(name)])
+        effort = float(robot.arrays.effort[column])
         np.testing.assert_allclose(loads[:, column], torque / effort, atol=1e-4)
         checked += abs(torque) > 0.5
     assert checked >= 5
@@ -221,13 +229,10 @@ def test_a_held_arm_weighs_on_the_motors_above_it(robot):
 def test_the_motors_jacobian_is_the_lacks_slope(robot):
     """In the air, turning and waving, by central differences; little is lacking, so the robust weight hardly moves."""
     rng = np.random.default_rng(4)
-    time = np.arange(8)[:, None] / FPS
-    wave = 0.4 * np.sin(12.0 * time + rng.normal(size=(1, robot.num_joints)))
-    turns = Rotation.from_rotvec(time * [0.3, 1.0, 0.5]).as_quat(scalar_first=True)
-    qpos = np.concatenate([np.tile([0.0, 0.0, 2.0], (8, 1)), turns, wave], axis=1)
+    qpos = tumbling(robot, rng, 8, wave=0.4, speed=12.0)
     problem = _Problem(robot, None, None, floor_points(robot), FPS, Timeline(8, None), Weights(), 0.02, 0.8)
     points = slice(robot.model.nbody, None)
-    share = 0.9 * np.abs(motor_loads(robot, problem.floor, qpos, FPS)).max()
+    share = 0.9 * np.abs(loads_of(robot, qpos)).max()
 
     def term(moved):
         pose = problem.pose(moved)
@@ -247,14 +252,13 @@ def test_falling_freely_needs_no_motor(robot):
     time = np.arange(10) / FPS
     qpos = standing(robot, 10)
     qpos[:, 2] += 1.0 + 2.0 * time - 0.5 * 9.81 * time**2
-    np.testing.assert_allclose(motor_loads(robot, floor_points(robot), qpos, FPS), 0.0, atol=1e-6)
+    np.testing.assert_allclose(loads_of(robot, qpos), 0.0, atol=1e-6)
 
 
 def test_standing_legs_carry_the_robot(robot):
     """What the floor pushes reaches the root through the legs: both alike, and far from their limits."""
-    loads = motor_loads(robot, floor_points(robot), standing(robot, 6), FPS)
-    names = [name for name, counts in zip(robot.joint_names, strong(robot), strict=True) if counts]
-    knees = loads[:, ["knee" in name for name in names]]
+    loads = loads_of(robot, standing(robot, 6))
+    knees = loads[:, ["knee" in name for name in robot.joint_names]]
     np.testing.assert_allclose(knees[:, 0], knees[:, 1], atol=1e-3)
     assert 0.02 < np.abs(loads).max() < 0.5
 
@@ -277,8 +281,7 @@ def test_a_motor_counts_beyond_its_share(robot):
     qpos = standing(robot, 6)
     problem = _Problem(robot, None, None, floor_points(robot), FPS, Timeline(6, None), Weights(), 0.02, 0.8)
     pose, points = problem.pose(qpos), slice(robot.model.nbody, None)
-    loads = np.zeros((4, robot.num_joints))
-    loads[:, strong(robot)] = motor_loads(robot, problem.floor, qpos, FPS)
+    loads = loads_of(robot, qpos)
 
     def lack(share):
         given = (qpos, pose.points[:, points], pose.points_jac[:, points], np.zeros(6, bool), FPS)
