@@ -148,6 +148,8 @@ class PPOConfig:
     entropy_cost: float = 0.005
     value_cost: float = 1.0
     clip_value: bool = True
+    equal_clips: bool = False  # every clip weighs the same in the losses, however few of the steps are its
+    anchor: float = 0.0  # weight of KL(π ‖ π_base) on the kept clips' steps, while unlearning
     max_gradient_norm: float = 1.0
     actor_layers: tuple[int, ...] = (1024, 512, 256, 128)
     critic_layers: tuple[int, ...] = (1024, 1024, 512, 256)

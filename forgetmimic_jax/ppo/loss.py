@@ -7,7 +7,7 @@ from flax import struct
 from jax import Array
 
 from forgetmimic_jax.config import Config, PPOConfig
-from forgetmimic_jax.ppo.network import entropy, log_prob
+from forgetmimic_jax.ppo.network import entropy, kl_divergence, log_prob
 
 WARM_UP = 0.05  # of a run
 
@@ -35,28 +35,33 @@ class Batch:
     target: Array  # of the value
     is_target: Array  # bool: the step's clip is to be forgotten
     clip: Array  # i32
+    weight: Array  # in the means of the PPO losses
     base: Prediction | None  # of the frozen base policy, where there is one
 
 
 def ppo_loss(
-    config: Config, batch: Batch, now: Prediction, iteration: Array | None = None, weight: Array | None = None
+    config: Config, batch: Batch, now: Prediction, iteration: Array | None = None
 ) -> tuple[Array, dict[str, Array]]:
-    """Clipped surrogate + value loss − entropy bonus [], to be minimised, and its parts.
+    """Clipped surrogate + value loss − entropy bonus + anchor [], to be minimised, and its parts.
 
     Args:
         config: coefficients.
         batch: the steps.
         now: of the networks that learn.
         iteration: i32[] of the run; PPO does not ask.
-        weight: [batch] of each step in the means; all the same by default.
     """
     ppo = config.ppo
     log_ratio = log_prob(batch.action, now.mean, now.log_std) - batch.log_prob
-    policy_term = policy_loss(log_ratio, batch.advantage, ppo.clip, weight)
-    value_term = value_loss(now.value, batch.value, batch.target, ppo.clip if ppo.clip_value else None, weight)
+    policy_term = policy_loss(log_ratio, batch.advantage, ppo.clip, batch.weight)
+    value_term = value_loss(now.value, batch.value, batch.target, ppo.clip if ppo.clip_value else None, batch.weight)
     entropy_term = entropy(now.log_std)
     loss = policy_term + ppo.value_cost * value_term - ppo.entropy_cost * entropy_term
-    return loss, {"policy_loss": policy_term, "value_loss": value_term, "entropy": entropy_term}
+    metrics = {"policy_loss": policy_term, "value_loss": value_term, "entropy": entropy_term}
+    if ppo.anchor and batch.base is not None:
+        away = kl_divergence(now.mean, now.log_std, batch.base.mean, batch.base.log_std)
+        metrics["anchor_kl"] = mean(away, batch.weight * ~batch.is_target)
+        loss += ppo.anchor * metrics["anchor_kl"]
+    return loss, metrics
 
 
 def policy_loss(log_ratio: Array, advantage: Array, clip: float, weight: Array | None = None) -> Array:
@@ -79,6 +84,17 @@ def mean(values: Array, weight: Array | None) -> Array:
     if weight is None:
         return values.mean()
     return (values * weight).sum() / jnp.maximum(weight.sum(), 1.0)
+
+
+def equal_share(group: Array, groups: int) -> Array:
+    """Weights [...], 1 on average, that give every group which is there the same sum, whatever its size.
+
+    Args:
+        group: i32[...] from 0.
+        groups: how many there may be.
+    """
+    size = jnp.zeros(groups).at[group.reshape(-1)].add(1.0)
+    return group.size / ((size > 0).sum() * size[group])
 
 
 def adapt_learning_rate(

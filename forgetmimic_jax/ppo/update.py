@@ -17,7 +17,7 @@ from jax import Array
 from forgetmimic_jax.config import PPOConfig
 from forgetmimic_jax.ppo import network
 from forgetmimic_jax.ppo.gae import centre_branches, generalized_advantages
-from forgetmimic_jax.ppo.loss import Batch, Prediction, adapt_learning_rate, trapezoid
+from forgetmimic_jax.ppo.loss import Batch, Prediction, adapt_learning_rate, equal_share, trapezoid
 from forgetmimic_jax.ppo.network import bound_std, kl_divergence, log_prob, normalize, update_normalizer
 from forgetmimic_jax.state import Policy, TrainState, make_actor, make_critic, make_optimizer
 from forgetmimic_jax.tracking import env as tracking
@@ -196,6 +196,7 @@ def improve(
         target=target,
         is_target=assets.is_target[trajectory.clip],
         clip=trajectory.clip,
+        weight=equal_share(trajectory.clip, len(assets.is_target)) if config.equal_clips else jnp.ones_like(advantage),
         base=_base_prediction(env, assets.base, trajectory),
     )
     batch = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)

@@ -9,6 +9,8 @@ and V_base(s) stands for the base's one-step target, whose mean it is under the 
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax.numpy as jnp
 from jax import Array
 
@@ -32,8 +34,9 @@ def in_two_phases(config: Config, batch: Batch, now: Prediction, iteration: Arra
     forgetting = iteration < FORGETTING * config.iterations
     block = max(1, round(FORGETTING * config.iterations / BLOCKS))
     on_targets = forgetting & (iteration // block % 2 == 1)
-    weight = jnp.where(on_targets, batch.is_target, ~batch.is_target)
-    loss, metrics = ppo_loss(config, batch, now, weight=weight)
+    in_block = jnp.where(on_targets, batch.is_target, ~batch.is_target)
+    weight = batch.weight * in_block
+    loss, metrics = ppo_loss(config, dataclasses.replace(batch, weight=weight), now)
     distance = mean((now.value - batch.base.value) ** 2, weight)
     loss += jnp.where(forgetting, 0.0, config.ppo.value_cost * DISTANCE) * distance
     return loss, metrics | {"base_value_distance": distance}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from forgetmimic_jax.config import PPOConfig
-from forgetmimic_jax.ppo.loss import adapt_learning_rate, policy_loss, trapezoid, value_loss
+from forgetmimic_jax.ppo.loss import adapt_learning_rate, equal_share, policy_loss, trapezoid, value_loss
 
 
 @pytest.mark.parametrize(
@@ -54,6 +54,18 @@ def test_losses_equal_rsl_rls_written_in_numpy(seed):
     values = np.maximum((value - target) ** 2, (clipped - target) ** 2).mean()
     np.testing.assert_allclose(policy_loss(jnp.asarray(log_ratio), jnp.asarray(advantage), 0.2), surrogate, rtol=1e-5)
     np.testing.assert_allclose(value_loss(*map(jnp.asarray, (value, old, target)), 0.2), values, rtol=1e-5)
+
+
+def test_weights_and_masks_choose_what_a_mean_is_of():
+    value, target, weight = jnp.array([1.0, 2.0, 3.0]), jnp.array([0.0, 4.0, 5.0]), jnp.array([3.0, 0.5, 0.0])
+    assert float(value_loss(value, value, target, None, weight)) == pytest.approx((3.0 * 1.0 + 0.5 * 4.0) / 3.5)
+    assert float(policy_loss(jnp.zeros(3), target, 0.2, weight)) == pytest.approx(-0.5 * 4.0 / 3.5)
+
+
+def test_equal_shares_by_hand():
+    """Three groups of four may be there, one step of the last, two and three of the others: each gets a third."""
+    share = equal_share(jnp.array([[0, 0, 0], [1, 1, 3]]), 4)
+    np.testing.assert_allclose(share, [[2 / 3, 2 / 3, 2 / 3], [1.0, 1.0, 2.0]], rtol=1e-6)
 
 
 @pytest.mark.parametrize(

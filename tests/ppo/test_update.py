@@ -251,6 +251,23 @@ def test_the_first_gradient_step_is_adams_on_rsl_rls_loss(problem):
         np.testing.assert_allclose(np.asarray(change)[clear], -1e-3 * np.sign(slope[clear]), rtol=5e-3)
 
 
+def test_clips_can_weigh_the_same(problem):
+    """The value loss of the first step: the mean of the clips' means, where one has a single step."""
+    env, state, batch, advantage, target = problem
+    clip = np.zeros((STEPS, ENVS), np.int32)
+    clip[0, 0] = 1
+    error = np.asarray((batch["value"] - target) ** 2)
+    losses = {}
+    for equal in (False, True):
+        ppo = dataclasses.replace(env.config.ppo, equal_clips=equal, clip_value=False)
+        run = SimpleNamespace(config=dataclasses.replace(env.config, ppo=ppo), robot=env.robot, assets=env.assets)
+        losses[equal] = float(
+            improved(run, state, batch | {"clip": jnp.asarray(clip)}, advantage, target)[1]["value_loss"]
+        )
+    assert losses[False] == pytest.approx(error.mean(), rel=1e-4)
+    assert losses[True] == pytest.approx((error[clip == 0].mean() + error[0, 0]) / 2, rel=1e-4)
+
+
 def test_the_normalisers_learn_the_batch_after_the_update(problem):
     env, state, batch, advantage, target = problem
     after, _ = improved(env, state, batch, advantage, target)
