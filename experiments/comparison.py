@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from experiments.validity import PLAIN
 from forgetmimic_jax.evaluation import paper, statistics
 from forgetmimic_jax.evaluation.tables import markdown_table, number
 from forgetmimic_jax.evaluation.variants import variant_bars, variant_table
@@ -15,6 +16,7 @@ CONTROL = "fine-tuned, all clips"
 METHODS: dict[str, dict[str, Any]] = {
     "fine-tuned, kept clips": {"method": "finetune"},
     CONTROL: {"method": "finetune", "clips": "all"},
+    "fine-tuned, all clips, plain PPO": {"method": "finetune", "clips": "all", **PLAIN},
     **{
         name.replace("_", " "): {"method": name}
         for name in (
@@ -23,6 +25,7 @@ METHODS: dict[str, dict[str, Any]] = {
         )
     },
     "arft, λ = 8": {"penalty": 8.0},
+    "arft, plain PPO": PLAIN,
 }
 
 

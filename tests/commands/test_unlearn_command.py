@@ -61,6 +61,8 @@ def test_its_settings_are_the_base_s_but_for_what_unlearning_changes(base_run, u
             schedule="trapezoid",
             learning_rate=3e-4,
             clip_value=False,
+            equal_clips=True,
+            anchor=0.1,
         ),
     )
 
