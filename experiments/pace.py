@@ -53,7 +53,7 @@ TEXT = """# Unlearning's pace on a laptop
 ¹ The anchor held the actions' mean and not yet their spread.
 
 - Targets are short clips, whose episodes get shorter as they are forgotten. In the run *nothing ¹* {first:.0f} % of the
-  steps are theirs in iterations 10 to 50, {last:.0f} % in the last 50, and a loss that is a mean over steps hardly hears
+  steps are theirs in iterations 10 to 50, {last:.0f} % in the last 50; a loss that is a mean over steps hardly hears
   them. To move them at all the step size had to be large, and at that size the noise of everything else wears down what
   is kept, the cartwheel first.
 - *Equal clips* (`ppo.equal_clips`): every clip weighs the same in the losses. A third of the step size then forgets
