@@ -62,7 +62,7 @@ TEXT = """# Unlearning's pace on a laptop
   where it was, and the step size can be large again. A weaker one holds less; with a small step size it is the targets
   that stay.
 - Without equal clips the anchor keeps as well, and forgets less.
-- Half of the length nearly does; the default lies between, and [validity](results/validity.md) has it over seeds.
+- Half of the length nearly does; the default lies between.
 
 ## Lengths and step sizes, without anchor and equal clips
 
