@@ -238,6 +238,10 @@ def _done(document: Mapping[str, Any], info: CheckpointInfo, base: CheckpointInf
         else "unknown: an imported policy",
         "Sampler": f"{config.sampling.rule.replace('_', ' ')}, from {config.sampling.clips} clips",
         "Assistive wrench": f"up to {config.wrench.max_gain:g}" if config.wrench.max_gain else "off",
+        "Weights in the loss": "every clip the same" if config.ppo.equal_clips else "every step the same",
+        "Anchor": f"{config.ppo.anchor:g} of the divergence from the base, on kept clips"
+        if config.ppo.anchor
+        else "off",
         "Step size": f"{config.ppo.learning_rate:g}, {config.ppo.schedule}",
         "Seeds": f"{config.seed} (unlearning), {document['seed']} (evaluation)",
         "Evaluation": f"{document['episodes']} episodes a clip with deterministic actions, no assistance, no "

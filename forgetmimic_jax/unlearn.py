@@ -26,7 +26,8 @@ from forgetmimic_jax.options import (
 class Options:
     """Make a base policy forget the target clips, by default with the anti-reward, then evaluate before and after.
 
-    Uniform sampling, no assistive wrench, Adam reset (the paper's ForgetMimic). Stop with Ctrl-C, go on with --resume.
+    Uniform sampling, no assistive wrench, Adam reset (the paper's ForgetMimic); at laptop scale kept clips are held to
+    the base (--set ppo.anchor=0 leaves it out). Stop with Ctrl-C, go on with --resume.
     """
 
     robot: str = "g1"
