@@ -17,29 +17,29 @@ HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "pace"
 PAGE = HERE / "pace.md"
 
-# By file: iterations, seed and what differs from today's `PACE`.
+# By file: iterations and what differs from today's `PACE`.
 TRIALS = {
-    "plain": (320, 0, "no anchor, clips weigh by their steps"),
-    "equal": (320, 0, "no anchor, learning_rate=1e-4"),
-    "equal_slower": (320, 0, "no anchor, learning_rate=4e-5"),
-    "held_only": (320, 0, "clips weigh by their steps"),
-    "held_slow": (320, 0, "learning_rate=1e-4 ¹"),
-    "held_less": (320, 0, "anchor=0.03, learning_rate=2e-4 ¹"),
-    "held": (320, 0, "nothing ¹"),
-    "half": (160, 0, "nothing"),
-    "half_faster_seed_1": (160, 1, "learning_rate=4e-4"),
+    "plain": (320, "no anchor, clips weigh by their steps"),
+    "equal": (320, "no anchor, learning_rate=1e-4"),
+    "equal_slower": (320, "no anchor, learning_rate=4e-5"),
+    "held_only": (320, "clips weigh by their steps"),
+    "held_slow": (320, "learning_rate=1e-4 ¹"),
+    "held_less": (320, "anchor=0.03, learning_rate=2e-4 ¹"),
+    "held": (320, "nothing ¹"),
+    "half": (160, "nothing"),
+    "half_faster_seed_1": (160, "learning_rate=4e-4"),
 }
 # No anchor, and clips weigh by their steps. A step size that falls from the first iteration on, and a share of the
 # starts for the targets, are no longer options.
 EARLIER = {
-    "long": (160, 0, "num_steps=24 minibatches=12 epochs=4 learning_rate=1.5e-4, falling from the start"),
-    "short": (320, 0, "minibatches=6 epochs=4 learning_rate=1.5e-4, falling from the start"),
-    "shorter": (240, 0, "num_steps=8 minibatches=3 learning_rate=2e-4"),
-    "slower": (320, 0, "learning_rate=2e-4, not rising at the start"),
-    "slower_seed_1": (320, 1, "the same"),
-    "share": (160, 0, "learning_rate=2e-4, falling from the start; a third of the starts for the targets"),
-    "chosen": (320, 0, "nothing"),
-    "control": (320, 0, "`--method finetune --clips all`, so no anti-reward"),
+    "long": (160, "num_steps=24 minibatches=12 epochs=4 learning_rate=1.5e-4, falling from the start"),
+    "short": (320, "minibatches=6 epochs=4 learning_rate=1.5e-4, falling from the start"),
+    "shorter": (240, "num_steps=8 minibatches=3 learning_rate=2e-4"),
+    "slower": (320, "learning_rate=2e-4, not rising at the start"),
+    "slower_seed_1": (320, "the same"),
+    "share": (160, "learning_rate=2e-4, falling from the start; a third of the starts for the targets"),
+    "chosen": (320, "nothing"),
+    "control": (320, "`--method finetune --clips all`, so no anti-reward"),
 }
 
 TEXT = """# Unlearning's pace on a laptop
@@ -82,18 +82,20 @@ On the base of 33.5 M steps and its clips, both since replaced ([base_policy.md]
 """
 
 
-def table(folder: Path, trials: Mapping[str, tuple[int, int, str]]) -> str:
+def table(folder: Path, trials: Mapping[str, tuple[int, str]]) -> str:
     """A row a trial, under the base's own."""
-    rows = []
-    for name, (iterations, seed, settings) in trials.items():
-        document = json.loads((folder / f"{name}.json").read_text())
-        policy, steps = document["policy"], document["environment_steps"]
-        cells = [percent(policy["target"]["success_rate"]), percent(policy["target"]["skill"])]
-        cells += [percent(policy["kept"]["success_rate"]), percent(policy["kept"]["skill"])]
-        rows.append([settings, str(seed), f"{iterations} iterations, {steps / 1e6:.1f} M steps", *cells])
-    base = json.loads((folder / f"{next(iter(trials))}.json").read_text())["base"]
-    rows.insert(0, ["*the base*", "", "", percent(base["target"]["success_rate"]), "",
-                    percent(base["kept"]["success_rate"]), ""])  # fmt: skip
+    documents = {name: json.loads((folder / f"{name}.json").read_text()) for name in trials}
+    base = next(iter(documents.values()))["base"]
+    cells = [percent(base["target"]["success_rate"]), "", percent(base["kept"]["success_rate"]), ""]
+    rows = [["*the base*", "", "", *cells]]
+    for name, (iterations, settings) in trials.items():
+        document = documents[name]
+        policy, budget = (
+            document["policy"],
+            f"{iterations} iterations, {document['environment_steps'] / 1e6:.1f} M steps",
+        )
+        cells = [percent(policy[group][metric]) for group in ("target", "kept") for metric in ("success_rate", "skill")]
+        rows.append([settings, str(document["seed"]), budget, *cells])
     header = ["other than today", "seed", "budget", "target success", "target skill left", "kept success"]
     return markdown_table([*header, "kept skill left"], rows)
 

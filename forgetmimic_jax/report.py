@@ -77,7 +77,7 @@ def main(options: Options) -> None:
     facts = {
         "verdict": {"word": verdict.word, "reasons": list(verdict.reasons), "rules": RULES},
         "asked": _asked(document),
-        "done": _done(document, info, base),
+        "done": _done(document, info, base, rows),
         "cards": _cards(document, rows),
         "threshold": _threshold(info.config, rows),
         "notes": tables.notes(document),
@@ -218,7 +218,9 @@ def _asked(document: Mapping[str, Any]) -> str:
     )
 
 
-def _done(document: Mapping[str, Any], info: CheckpointInfo, base: CheckpointInfo) -> dict[str, str]:
+def _done(
+    document: Mapping[str, Any], info: CheckpointInfo, base: CheckpointInfo, rows: Sequence[Mapping[str, Any]]
+) -> dict[str, str]:
     from forgetmimic_jax import unlearning
     from forgetmimic_jax.unlearning.registry import find_method
 
@@ -238,9 +240,9 @@ def _done(document: Mapping[str, Any], info: CheckpointInfo, base: CheckpointInf
         else "unknown: an imported policy",
         "Sampler": f"{config.sampling.rule.replace('_', ' ')}, from {config.sampling.clips} clips",
         "Assistive wrench": f"up to {config.wrench.max_gain:g}" if config.wrench.max_gain else "off",
-        "Weights in the loss": "every clip the same" if config.ppo.equal_clips else "every step the same",
+        "Weights in PPO's losses": "every clip the same" if config.ppo.equal_clips else "every step the same",
         "Anchor": f"{config.ppo.anchor:g} of the divergence from the base, on kept clips"
-        if config.ppo.anchor
+        if rows and "anchor_kl" in rows[-1]  # some methods' losses have none
         else "off",
         "Step size": f"{config.ppo.learning_rate:g}, {config.ppo.schedule}",
         "Seeds": f"{config.seed} (unlearning), {document['seed']} (evaluation)",

@@ -146,6 +146,8 @@ def config_of_new_run(options: Options) -> Config:
         # fast at first, settling what is kept at the end. The targets' values change sign, which a clip would slow.
         config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, **PACE))
     elif start == "fresh":
+        # The base may be an unlearned policy, whose settings held it to its own base.
+        config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, anchor=0.0))
         iterations = max(1, round(info.environment_steps / (config.ppo.num_envs * config.ppo.num_steps)))
     config = dataclasses.replace(config, base=None, evaluate_every=0, iterations=iterations)
     config = replace_given(config, robot=options.robot, seed=options.seed, library=options.library, base=options.base)

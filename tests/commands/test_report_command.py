@@ -112,6 +112,7 @@ def test_the_facts_lie_beside_it(facts, run):
     assert facts["verdict"]["rules"] == RULES
     assert facts["evaluation"] == json.loads((run / "evaluation.json").read_text())
     assert facts["done"]["Penalty λ"] == "16"
+    assert facts["done"]["Anchor"] == "0.1 of the divergence from the base, on kept clips"
 
 
 def test_the_command_that_reproduces_it_gives_the_runs_settings(facts, run):

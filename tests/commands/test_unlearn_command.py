@@ -292,6 +292,12 @@ def test_a_wrench_that_the_base_did_not_have_is_the_paper_s(options, damaged):
     assert unlearn.config_of_new_run(options(base=damaged, wrench=True)).wrench.max_gain == 0.6
 
 
+def test_a_policy_from_scratch_is_held_by_nothing(options, unlearned_run):
+    base = unlearned_run.checkpoint(2)
+    anchors = [unlearn.config_of_new_run(options(method=name, base=base)).ppo.anchor for name in ("arft", "retrain")]
+    assert anchors == [0.1, 0.0]
+
+
 def test_retraining_takes_as_many_steps_as_the_base_did(options):
     assert unlearn.config_of_new_run(options(method="retrain")).iterations == 4
     assert unlearn.config_of_new_run(options(method="retrain", iterations=None, preset="paper")).iterations == 1
