@@ -1,7 +1,7 @@
 """A study: trials, what is measured of them, and how it is told: one JSON, one page with its table, one figure.
 
 The JSON is the only source of the page and the figure. Every study takes the same options and finds the finished trials
-of the others (`trials`); one whose JSON already answers what is asked runs nothing.
+of the others (`trials`) and what their JSON says of them; one whose JSON already answers what is asked runs nothing.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
     from forgetmimic_jax.evaluation.metrics import Rollout
     from forgetmimic_jax.motion.clip import Clip
+    from forgetmimic_jax.trials import Trial
 
 RESULTS = Path(__file__).resolve().parents[1] / "experiments" / "results"
 K = TypeVar("K", bound=Hashable)
@@ -99,7 +100,14 @@ class Study:
 class Lab:
     """Where a study's trials are run: the options, resolved."""
 
-    def __init__(self, options: Options, iterations: int):
+    def __init__(self, options: Options, iterations: int, known: Mapping[str, Any] | None = None):
+        """Check the options.
+
+        Args:
+            options: of the study.
+            iterations: of each trial.
+            known: what is known already of trials, by their name (`known_trials`).
+        """
         from forgetmimic_jax import checkpoint, runner
 
         for flag in ("seeds", "episodes", "jobs"):
@@ -117,6 +125,7 @@ class Lab:
         runner.check_targets(self.targets, self.info.clips)
         self.seeds = tuple(range(options.seeds))
         self.failed: dict[str, str] = {}
+        self.known = known or {}
 
     @property
     def control_iterations(self) -> int:
@@ -149,27 +158,28 @@ class Lab:
             "set": list(itertools.chain(*self.options.set)),
         }
 
+    def trial(self, variant: Mapping[str, Any]) -> Trial:
+        """What differs from the default unlearning run as told by options of `forgetmimic_jax.unlearn`; `set` adds."""
+        from forgetmimic_jax.trials import make_trial
+
+        options = self.options
+        asked: dict[str, Any] = {"robot": options.robot, "base": self.base, "targets": ",".join(self.targets)}
+        asked |= {"iterations": self.iterations, "episodes": options.episodes, "physics": options.physics}
+        asked |= {"library": options.library, "preset": "paper" if options.budget == "paper" else None}
+        together = [*itertools.chain(*options.set), *variant.get("set", [])]
+        return make_trial(options.trials, asked | dict(variant) | ({"set": together} if together else {}))
+
     def run(self, variants: Mapping[K, Mapping[str, Any]], what: str) -> dict[K, Path]:
         """Train and evaluate what differs from the default unlearning run as told; the folders of those that finished.
 
         Args:
-            variants: by any key, options of `forgetmimic_jax.unlearn`; `set` adds to the study's own.
+            variants: by any key; see `trial`.
             what: is being done, for the progress line.
         """
-        from forgetmimic_jax.trials import make_trial, run_trials
+        from forgetmimic_jax.trials import run_trials
 
-        options = self.options
-        common: dict[str, Any] = {"robot": options.robot, "base": self.base, "targets": ",".join(self.targets)}
-        common |= {"iterations": self.iterations, "episodes": options.episodes, "physics": options.physics}
-        common |= {"library": options.library, "preset": "paper" if options.budget == "paper" else None}
-        settings = list(itertools.chain(*options.set))
-        trials = {}
-        for key, variant in variants.items():
-            asked = {**common, **variant}
-            together = [*settings, *variant.get("set", [])]
-            asked.pop("set", None)
-            trials[key] = make_trial(options.trials, asked | ({"set": together} if together else {}))
-        failed = run_trials(list(trials.values()), jobs=options.jobs, description=what)
+        trials = {key: self.trial(variant) for key, variant in variants.items()}
+        failed = run_trials(list(trials.values()), jobs=self.options.jobs, description=what)
         self.failed |= {trial.folder.name: reason for trial, reason in failed.items()}
         finished = {key: trial.folder for key, trial in trials.items() if trial not in failed}
         if not finished:
@@ -179,7 +189,7 @@ class Lab:
     def over_seeds(
         self, variants: Mapping[str, Mapping[str, Any]], what: str, *, seeds: Mapping[str, Sequence[int]] | None = None
     ) -> dict[str, Any]:
-        """Every variant with every seed, and what they have in common over the seeds.
+        """Every variant with every seed, and what they have in common over the seeds; runs only what is not known.
 
         Args:
             variants: by label, options of `forgetmimic_jax.unlearn`.
@@ -187,15 +197,22 @@ class Lab:
             seeds: by label, other seeds than the study's.
         """
         every = {label: (seeds or {}).get(label, self.seeds) for label in variants}
-        folders = self.run(
-            {(label, seed): {**variants[label], "seed": seed} for label in variants for seed in every[label]}, what
-        )
+        asked = sorted(((label, seed) for label in variants for seed in every[label]), key=lambda key: key[1])
+        options = {(label, seed): {**variants[label], "seed": seed} for label, seed in asked}
+        names = {key: self.trial(variant).folder.name for key, variant in options.items()}
+        missing = {key: variant for key, variant in options.items() if names[key] not in self.known}
+        folders = self.run(missing, what) if missing else {}
         result = {}
         for label, variant in variants.items():
-            runs = {seed: summary(folders[label, seed]) for seed in every[label] if (label, seed) in folders}
+            runs = {
+                seed: self.known.get(names[label, seed]) or summary(folders[label, seed])
+                for seed in every[label]
+                if names[label, seed] in self.known or (label, seed) in folders
+            }
             if runs:
                 result[label] = {
                     "options": {name: str(value) for name, value in variant.items()},
+                    "trials": {str(seed): names[label, seed] for seed in runs},
                     "seeds": {str(seed): run for seed, run in runs.items()},
                     "over_seeds": over_seeds(list(runs.values())),
                 }
@@ -236,6 +253,13 @@ def newest_policy(folder: Path) -> Path:
     return newest
 
 
+def known_trials(folder: Path) -> dict[str, Any]:
+    """What the studies in a folder say of the trials of their variants, by the trial's name."""
+    documents = [_read(path) or {} for path in sorted(folder.glob("*.json"))]
+    variants = [of for document in documents for of in document.get("results", {}).get("variants", {}).values()]
+    return {name: of["seeds"][seed] for of in variants for seed, name in of["trials"].items()}
+
+
 def conduct(study: Study, options: Options, next_command: str) -> None:
     """Measure what the JSON does not hold already, and tell it; exit code 1 where a trial failed."""
     from forgetmimic_jax import runner
@@ -249,7 +273,7 @@ def conduct(study: Study, options: Options, next_command: str) -> None:
             raise InputError(f"{path}: not measured yet; leave --draw out")
     else:
         iterations = study.iterations[options.budget] if options.iterations is None else options.iterations
-        lab = Lab(options, iterations)
+        lab = Lab(options, iterations, known_trials(folder))
         asked = lab.asked() | {"asks": list(study.asks)}
         if document is None or document["asked"] != asked or document["failed"]:
             results = study.measure(lab)

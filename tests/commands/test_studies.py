@@ -113,6 +113,27 @@ def test_other_seeds_find_the_finished_trials(swept, base_run, monkeypatch, tmp_
     assert document["results"]["variants"]["λ = 16"]["seeds"].keys() == {"0"}
 
 
+def test_a_further_seed_runs_alone_where_the_numbers_of_the_others_are_stored(swept, base_run, monkeypatch, tmp_path):
+    folder, _ = swept
+    (stored,) = json.loads((folder / "out" / "seeds.json").read_text())["results"]["variants"].values()
+    shutil.copy(folder / "out" / "seeds.json", tmp_path / "another_study.json")
+    asked_for = []
+
+    def stand_in(asked, **_):
+        asked_for.extend(asked)
+        for trial in asked:
+            shutil.copytree(folder / "trials" / stored["trials"]["0"], trial.folder)
+        return {}
+
+    monkeypatch.setattr(trials, "run_trials", stand_in)
+    given = {"seeds": 3, "trials": tmp_path / "trials", "output": tmp_path}
+    finished(sweep.main, options(sweep.Options, base_run, tmp_path, kind="seeds", **given))
+    assert [trial.flags[trial.flags.index("--seed") + 1] for trial in asked_for] == ["2"]
+    (extended,) = json.loads((tmp_path / "seeds.json").read_text())["results"]["variants"].values()
+    assert list(extended["seeds"].items())[:2] == list(stored["seeds"].items())
+    assert extended["over_seeds"]["policy"]["kept"]["episode_length"]["n"] == 3
+
+
 def test_the_files_can_be_drawn_from_the_numbers_alone(swept, tmp_path):
     folder, _ = swept
     shutil.copy(folder / "out" / "seeds.json", tmp_path)
