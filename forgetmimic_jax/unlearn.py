@@ -50,7 +50,7 @@ class Options:
     preset: Literal["cpu", "paper"] | None = None
     """Settings of the fine-tuning; by default the base's own, at the default budget of a laptop."""
     iterations: int | None = None
-    """PPO iterations; 240 by default (1000 with --preset paper), retrain: as many steps as the base was trained for."""
+    """PPO iterations; 320 by default (1000 with --preset paper), retrain: as many steps as the base was trained for."""
     seed: int = 0
     """Random seed of the fine-tuning and of the evaluation."""
     base: Path | None = None
@@ -69,7 +69,7 @@ class Options:
     """Any other settings, such as sampling.rule=adaptive."""
 
 
-ITERATIONS = {"cpu": 240, "paper": 1000}
+ITERATIONS = {"cpu": 320, "paper": 1000}
 # On a laptop (experiments/pace.md): short iterations, for forgetting takes some hundred whatever their length. Targets
 # are a few steps in a hundred, less as they are forgotten, so clips weigh the same; and what the noise of fast learning
 # would do to the kept clips, the base holds.
