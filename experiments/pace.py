@@ -101,10 +101,10 @@ def table(folder: Path, trials: Mapping[str, tuple[int, str]]) -> str:
     """A row a trial, under the base's own on the episodes of each seed."""
     documents = {name: json.loads((folder / f"{name}.json").read_text()) for name in trials}
     bases = {document["seed"]: document["base"] for document in documents.values()}
-    rows = [
-        ["*the base*", str(seed), "", percent(of["target"]["success_rate"]), "", percent(of["kept"]["success_rate"]), ""]
-        for seed, of in bases.items()
-    ]
+    rows = []
+    for seed, base in bases.items():
+        target, kept = (percent(base[group]["success_rate"]) for group in ("target", "kept"))
+        rows.append(["*the base*", str(seed), "", target, "", kept, ""])
     for name, (iterations, settings) in trials.items():
         document = documents[name]
         policy, budget = (
@@ -121,7 +121,8 @@ def main() -> None:
     """Write the page."""
     share = json.loads((RESULTS / "held.json").read_text())["target_step_share"]
     first, last = (100 * np.mean(part) for part in (share[1:6], share[-5:]))
-    tables = {"shipped": table(RESULTS / "shipped", SHIPPED), "table": table(RESULTS, TRIALS), "earlier": table(RESULTS / "earlier", EARLIER)}
+    tables = {"table": table(RESULTS, TRIALS)}
+    tables |= {name: table(RESULTS / name, of) for name, of in (("shipped", SHIPPED), ("earlier", EARLIER))}
     PAGE.write_text(TEXT.format(**tables, first=first, last=last))
     print(f"page  {PAGE}")
 

@@ -61,7 +61,7 @@ class Retarget:
     output: Path
     """Folder for the library; one without other files, or a library to be replaced with --force."""
     clips: str | None = None
-    """Clips to make, comma-separated; all of the shipped by default."""
+    """Clips to make, comma-separated; by default those that are shipped for the robot, all for another one."""
     force: bool = False
     """Replace the library in the output folder."""
 
@@ -177,14 +177,18 @@ def import_motion(robot: Robot, options: Import) -> None:
 def retarget(robot: Robot, options: Retarget) -> None:
     """Make the shipped library again."""
     from forgetmimic_jax.motion import recipe
-    from forgetmimic_jax.motion.library import MANIFEST
+    from forgetmimic_jax.motion.library import DATA_DIR, MANIFEST, read_manifest
 
     if options.output.is_dir() and any(options.output.iterdir()):
         if not (options.output / MANIFEST).exists():
             raise InputError(f"{options.output}: has files but no {MANIFEST}; give an empty or a new folder")
         if not options.force:
             raise InputError(f"{options.output}: already holds a library; give another --output, or --force")
-    names = recipe.CLIPS if options.clips is None else comma_separated(options.clips)
+    shipped = DATA_DIR / robot.name
+    if options.clips is None:
+        names = tuple(read_manifest(shipped)["clips"] if shipped.is_dir() else recipe.CLIPS)
+    else:
+        names = comma_separated(options.clips)
     recipe.retarget_library(robot, options.source, options.output, names, report=lambda name: print(name, flush=True))
     closing(
         {"library": options.output},

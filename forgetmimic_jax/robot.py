@@ -22,6 +22,7 @@ from forgetmimic_jax.errors import InputError, nearest
 ROBOTS_DIR = Path(__file__).resolve().parent.parent / "robots"
 CONTACT_SENSOR = "contact_"
 VISUAL_GROUP = 2  # the geom group of the shapes that are only seen
+G1_ROOT_HEIGHT = 0.793  # m, of the G1's pelvis in its MJCF
 
 
 @struct.dataclass
@@ -218,6 +219,11 @@ def read_spec(name: str, robots_dir: Path = ROBOTS_DIR) -> mujoco.MjSpec:
     if not file.is_file():
         raise InputError(f"{path}: model: no file '{file.name}'")
     return mujoco.MjSpec.from_file(str(file))
+
+
+def relative_height(model: mujoco.MjModel) -> float:
+    """How tall a robot is beside the G1, by the height of its root in its MJCF: what views of it scale by."""
+    return float(model.body_pos[1, 2]) / G1_ROOT_HEIGHT
 
 
 def _read_roles(path: Path) -> dict[str, Any]:

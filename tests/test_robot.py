@@ -10,7 +10,7 @@ import yaml
 from forgetmimic_jax.errors import InputError
 from forgetmimic_jax.robot import CONTACT_SENSOR, ROBOTS_DIR, VISUAL_GROUP, load_robot, read_spec, robot_names
 
-REFERENCE = Path(__file__).resolve().parents[2] / "shared/data/robots/g1_reference.xml"
+REFERENCES = Path(__file__).resolve().parents[2] / "shared/data/robots"
 
 # Motor table of mjlab 1.6.0, asset_zoo/unitree_g1: joint pattern -> effort N m, armature kg m^2, kp, kd, action scale.
 G1_MOTORS = {
@@ -35,17 +35,34 @@ def g1():
     return load_robot("g1")
 
 
-@pytest.fixture(scope="module")
-def reference():
-    """Unitree's own G1 without its meshes, which carry no mass."""
-    if not REFERENCE.is_file():
-        pytest.skip("the G1 reference file is not beside this checkout (shared/data/robots)")
-    tree = ET.parse(REFERENCE)
-    for parent in list(tree.iter()):
+def unitrees(file):
+    """Unitree's own robot without its meshes and shapes, which carry no mass."""
+    if not (REFERENCES / file).is_file():
+        pytest.skip(f"{file} is not beside this checkout (shared/data/robots)")
+    root = ET.parse(REFERENCES / file).getroot()
+    for parent in list(root.iter()):
         for child in list(parent):
-            if child.tag == "mesh" or (child.tag == "geom" and "mesh" in child.attrib):
+            if child.tag in ("mesh", "visual", "collision") or (child.tag == "geom" and "mesh" in child.attrib):
                 parent.remove(child)
-    return mujoco.MjModel.from_xml_string(ET.tostring(tree.getroot(), encoding="unicode"))
+    if root.tag == "robot":  # a URDF, whose base stands on nothing; fixed links become part of their parents
+        root.remove(root.find("mujoco"))
+        ET.SubElement(root, "link", name="world")
+        joint = ET.SubElement(root, "joint", name="root", type="floating")
+        ET.SubElement(joint, "parent", link="world")
+        ET.SubElement(joint, "child", link="pelvis")
+    return mujoco.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
+
+
+@pytest.fixture(scope="module")
+def h2():
+    return load_robot("h2")
+
+
+@pytest.fixture(scope="module", params=[("g1", "g1_reference.xml"), ("h2", "H2.urdf")], ids=["g1", "h2"])
+def both(request):
+    """Our robot, and Unitree's model of it."""
+    name, file = request.param
+    return request.getfixturevalue(name), unitrees(file)
 
 
 def at_zero(model):
@@ -61,28 +78,55 @@ def world_inertia(model, data, body):
     return rotation @ np.diag(model.body(body).inertia) @ rotation.T
 
 
-def test_g1_is_unitrees_body_by_body(g1, reference):
-    ours, theirs = at_zero(g1.model), at_zero(reference)
+def test_a_robot_is_unitrees_body_by_body(both):
+    robot, reference = both
+    ours, theirs = at_zero(robot.model), at_zero(reference)
     names = [reference.body(body).name for body in range(1, reference.nbody)]
-    assert [g1.model.body(body).name for body in range(1, g1.model.nbody)] == names
-    assert g1.model.body_subtreemass[1] == pytest.approx(reference.body_subtreemass[1], abs=1e-6)
+    assert [robot.model.body(body).name for body in range(1, robot.model.nbody)] == names
+    assert robot.model.body_subtreemass[1] == pytest.approx(reference.body_subtreemass[1], abs=1e-6)
     for name in names:
-        assert g1.model.body(name).mass == pytest.approx(reference.body(name).mass), name
-        np.testing.assert_allclose(ours.body(name).xpos, theirs.body(name).xpos, atol=1e-6, err_msg=name)
-        np.testing.assert_allclose(ours.body(name).xmat, theirs.body(name).xmat, atol=1e-6, err_msg=name)
-        np.testing.assert_allclose(ours.body(name).xipos, theirs.body(name).xipos, atol=1e-6, err_msg=name)
-        inertias = world_inertia(g1.model, ours, name), world_inertia(reference, theirs, name)
-        np.testing.assert_allclose(*inertias, atol=1e-8, err_msg=name)
+        assert robot.model.body(name).mass == pytest.approx(reference.body(name).mass), name
+        np.testing.assert_allclose(ours.body(name).xpos, theirs.body(name).xpos, atol=2e-6, err_msg=name)
+        np.testing.assert_allclose(ours.body(name).xmat, theirs.body(name).xmat, atol=2e-6, err_msg=name)
+        np.testing.assert_allclose(ours.body(name).xipos, theirs.body(name).xipos, atol=2e-6, err_msg=name)
+        inertias = world_inertia(robot.model, ours, name), world_inertia(reference, theirs, name)
+        np.testing.assert_allclose(*inertias, atol=1e-8 + 2e-6 * np.trace(inertias[1]), err_msg=name)
 
 
-def test_g1_is_unitrees_joint_by_joint(g1, reference):
-    ours, theirs = at_zero(g1.model), at_zero(reference)
+def test_a_robot_is_unitrees_joint_by_joint(both):
+    robot, reference = both
+    ours, theirs = at_zero(robot.model), at_zero(reference)
     names = [reference.joint(j).name for j in range(reference.njnt) if reference.jnt_type[j] != 0]
-    assert list(g1.joint_names) == names
+    assert list(robot.joint_names) == names
     for name in names:
-        np.testing.assert_allclose(ours.joint(name).xaxis, theirs.joint(name).xaxis, atol=1e-9, err_msg=name)
-        np.testing.assert_allclose(ours.joint(name).xanchor, theirs.joint(name).xanchor, atol=1e-6, err_msg=name)
-        np.testing.assert_allclose(g1.model.joint(name).range, reference.joint(name).range, atol=1e-6, err_msg=name)
+        np.testing.assert_allclose(ours.joint(name).xaxis, theirs.joint(name).xaxis, atol=1e-6, err_msg=name)
+        np.testing.assert_allclose(ours.joint(name).xanchor, theirs.joint(name).xanchor, atol=2e-6, err_msg=name)
+        np.testing.assert_allclose(robot.model.joint(name).range, reference.joint(name).range, atol=1e-5, err_msg=name)
+
+
+def test_h2_weighs_76_kg_with_its_pelvis_and_hands(h2):
+    assert float(h2.arrays.mass) == pytest.approx(75.587, abs=1e-3)
+    assert h2.num_joints == 31
+    assert len(h2.key_bodies) == 14
+    # The link that carries the sole is the ankle's last one, which for the H2 is the pitch.
+    assert [h2.key_bodies[foot] for foot in h2.feet] == ["left_ankle_pitch_link", "right_ankle_pitch_link"]
+    assert [h2.joint_names.index(f"left_ankle_{axis}_joint") for axis in ("roll", "pitch")] == [4, 5]
+    assert [h2.joint_names.index(name) for name in ("head_pitch_joint", "left_shoulder_pitch_joint")] == [15, 17]
+
+
+def test_h2_motors_are_unitrees_and_its_gains_are_near_those_of_others(h2):
+    file = REFERENCES / "H2.urdf"
+    if not file.is_file():
+        pytest.skip("H2.urdf is not beside this checkout (shared/data/robots)")
+    limits = {joint.get("name"): joint.find("limit") for joint in ET.parse(file).getroot().findall("joint")}
+    for index, joint in enumerate(h2.joint_names):
+        assert float(h2.arrays.effort[index]) == pytest.approx(float(limits[joint].get("effort"))), joint
+        assert h2.joint_velocity_limit[index] == pytest.approx(float(limits[joint].get("velocity"))), joint
+    kp = dict(zip(h2.joint_names, h2.arrays.stiffness.tolist(), strict=True))
+    # unitree_rl_mjlab holds legs with 200, waist with 150, ankles and arms with 40, wrists with 20.
+    others = {"left_knee": 200.0, "waist_roll": 150.0, "left_ankle_pitch": 40.0, "left_elbow": 40.0}
+    for joint, theirs in others.items():
+        assert 0.5 < kp[f"{joint}_joint"] / theirs < 2.0, joint
 
 
 def test_g1_weighs_33_kg(g1):
@@ -122,13 +166,25 @@ def test_g1_ranges(g1, joint):
     assert float(g1.arrays.soft_upper[index]) == pytest.approx(upper - margin, abs=1e-4)
 
 
-def test_g1_stands_on_its_soles_in_the_default_pose(g1):
-    data = mujoco.MjData(g1.model)
-    data.qpos[:7] = [0, 0, g1.default_height, 1, 0, 0, 0]
-    data.qpos[7:] = g1.arrays.default_joint_pos
-    mujoco.mj_kinematics(g1.model, data)
-    lowest = data.geom_xpos[g1.foot_geom_ids, 2] - g1.model.geom_size[g1.foot_geom_ids, 0]
+@pytest.mark.parametrize("name", ["g1", "h2"])
+def test_a_robot_stands_on_its_soles_in_the_default_pose(name, request):
+    robot = request.getfixturevalue(name)
+    data = mujoco.MjData(robot.model)
+    data.qpos[:7] = [0, 0, robot.default_height, 1, 0, 0, 0]
+    data.qpos[7:] = robot.arrays.default_joint_pos
+    mujoco.mj_kinematics(robot.model, data)
+    lowest = data.geom_xpos[robot.foot_geom_ids, 2] - robot.model.geom_size[robot.foot_geom_ids, 0]
     np.testing.assert_allclose(lowest, 0.0, atol=0.01)
+
+
+@pytest.mark.parametrize("name", ["g1", "h2"])
+def test_a_robot_touches_nothing_of_itself_in_the_default_pose(name):
+    robot = load_robot(name, self_collision=True)
+    data = mujoco.MjData(robot.model)
+    data.qpos[:7] = [0, 0, 2.0, 1, 0, 0, 0]
+    data.qpos[7:] = robot.arrays.default_joint_pos
+    mujoco.mj_forward(robot.model, data)
+    assert data.ncon == 0
 
 
 def test_whole_body_inertia_is_the_composite_one(g1):
@@ -144,16 +200,18 @@ def test_whole_body_inertia_is_the_composite_one(g1):
     np.testing.assert_allclose(g1.arrays.inertia, mass_matrix[3:6, 3:6] - shift, rtol=1e-4, atol=1e-4)
 
 
-def test_shapes_to_be_seen_weigh_nothing_touch_nothing_and_are_not_simulated(g1):
-    drawn = read_spec("g1").compile()
+@pytest.mark.parametrize("name", ["g1", "h2"])
+def test_shapes_to_be_seen_weigh_nothing_touch_nothing_and_are_not_simulated(name, request):
+    robot = request.getfixturevalue(name)
+    drawn = read_spec(name).compile()
     seen = drawn.geom_group == VISUAL_GROUP
     assert seen.sum() > 50
     assert not drawn.geom_contype[seen].any()
     assert not drawn.geom_conaffinity[seen].any()
-    assert g1.model.ngeom == (~seen).sum()
-    assert VISUAL_GROUP not in g1.model.geom_group
+    assert robot.model.ngeom == (~seen).sum()
+    assert VISUAL_GROUP not in robot.model.geom_group
     for field in ("body_mass", "body_inertia", "body_ipos", "body_iquat"):
-        np.testing.assert_array_equal(getattr(drawn, field), getattr(g1.model, field), err_msg=field)
+        np.testing.assert_array_equal(getattr(drawn, field), getattr(robot.model, field), err_msg=field)
     for side in ("left", "right"):
         bodies = [drawn.body(body).name for body in drawn.geom_bodyid[seen]]
         assert sum(body.startswith(side) for body in bodies) > 20

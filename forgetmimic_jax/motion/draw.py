@@ -11,10 +11,10 @@ from PIL import Image, ImageDraw
 
 from forgetmimic_jax.motion.clip import Clip
 from forgetmimic_jax.motion.kinematics import configuration
-from forgetmimic_jax.robot import Robot
+from forgetmimic_jax.robot import Robot, relative_height
 
 WIDTH, HEIGHT, CAPTION = 132, 160, 16  # pixels of one frame, and of the line above a strip
-PIXELS_PER_M = 88.0
+PIXELS_PER_M = 88.0  # for a robot of the G1's height
 SMOOTH = 3  # drawn this much larger, then shrunk
 FLOOR_LINE = HEIGHT - 30  # pixel row of the floor below the root
 AZIMUTH, ELEVATION = np.radians(60.0), np.radians(10.0)  # of the viewer, from the robot's starting x axis
@@ -62,24 +62,30 @@ def picture(robot: Robot, qpos: np.ndarray) -> Image.Image:
         if geom in robot.foot_geom_ids:  # joined to the ankle, so that the foot is seen
             ends = np.stack([data.xpos[model.geom_bodyid[geom]], data.geom_xpos[geom]])
         shapes.append((ends, model.geom_size[geom, 0], colour))
+    scale = PIXELS_PER_M / relative_height(model)
     for ends, radius, _ in shapes:
-        _line(pen, ends * [1.0, 1.0, 0.0], qpos, radius, SHADOW)
+        _line(pen, ends * [1.0, 1.0, 0.0], qpos, radius, SHADOW, scale)
     towards = np.array([np.cos(AZIMUTH) * np.cos(ELEVATION), np.sin(AZIMUTH) * np.cos(ELEVATION), np.sin(ELEVATION)])
     for ends, radius, colour in sorted(shapes, key=lambda shape: float(np.mean(shape[0] @ towards))):
-        _line(pen, ends, qpos, radius, colour)
+        _line(pen, ends, qpos, radius, colour, scale)
     return image.resize((WIDTH, HEIGHT), Image.Resampling.LANCZOS)
 
 
 def _line(
-    pen: ImageDraw.ImageDraw, ends: np.ndarray, qpos: np.ndarray, radius: float, colour: tuple[int, int, int]
+    pen: ImageDraw.ImageDraw,
+    ends: np.ndarray,
+    qpos: np.ndarray,
+    radius: float,
+    colour: tuple[int, int, int],
+    scale: float,
 ) -> None:
-    """A thick line with round ends between two world positions [2, 3] m."""
+    """A thick line with round ends between two world positions [2, 3] m, at `scale` pixels a m."""
     relative = ends - [qpos[0], qpos[1], 0.0]
     across = relative @ [-np.sin(AZIMUTH), np.cos(AZIMUTH), 0.0]
     away = relative @ [-np.cos(AZIMUTH), -np.sin(AZIMUTH), 0.0]
     up = relative[:, 2] * np.cos(ELEVATION) + away * np.sin(ELEVATION)
-    pixels = np.stack([WIDTH / 2 + PIXELS_PER_M * across, FLOOR_LINE - PIXELS_PER_M * up], axis=-1) * SMOOTH
-    thickness = radius * PIXELS_PER_M * SMOOTH
+    pixels = np.stack([WIDTH / 2 + scale * across, FLOOR_LINE - scale * up], axis=-1) * SMOOTH
+    thickness = radius * scale * SMOOTH
     pen.line([tuple(pixels[0]), tuple(pixels[1])], fill=colour, width=max(1, round(2 * thickness)))
     for x, y in pixels:
         pen.ellipse([x - thickness, y - thickness, x + thickness, y + thickness], fill=colour)

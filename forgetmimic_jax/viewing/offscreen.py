@@ -14,8 +14,9 @@ import mujoco
 import numpy as np
 
 from forgetmimic_jax.errors import InputError
-from forgetmimic_jax.robot import VISUAL_GROUP, read_spec
+from forgetmimic_jax.robot import VISUAL_GROUP, read_spec, relative_height
 
+# Distances are for a robot of the G1's height; for another they scale.
 GHOST_ALPHA = 0.2
 GHOST_FADE = 0.8  # m from the robot, from where the ghost pales; at twice that it is gone, lest it hide the robot
 GHOST_TINT = np.array([0.25, 0.65, 0.45])  # what the reference's colours are mixed with, half and half
@@ -61,6 +62,7 @@ class Renderer:
     def __init__(self, robot: str, width: int, height: int):
         self._model = drawing_model(robot, width, height)
         self._data = mujoco.MjData(self._model)
+        self._size = relative_height(self._model)
         self._rect = mujoco.MjrRect(0, 0, width, height)
         self._gl = _backend().GLContext(width, height)
         self._gl.make_current()
@@ -93,8 +95,8 @@ class Renderer:
             [height, width, 3] u8.
         """
         camera = mujoco.MjvCamera()
-        camera.lookat[:] = [*look_at, CAMERA_HEIGHT]
-        camera.distance, camera.azimuth, camera.elevation = CAMERA_DISTANCE, azimuth, CAMERA_ELEVATION
+        camera.lookat[:] = [*look_at, CAMERA_HEIGHT * self._size]
+        camera.distance, camera.azimuth, camera.elevation = CAMERA_DISTANCE * self._size, azimuth, CAMERA_ELEVATION
         everything, moving = mujoco.mjtCatBit.mjCAT_ALL, mujoco.mjtCatBit.mjCAT_DYNAMIC
         shadowless = mujoco.mjtCatBit.mjCAT_DECOR
         scene, perturbation = self._scene, mujoco.MjvPerturb()
@@ -106,7 +108,7 @@ class Renderer:
         if reference is not None:
             solid = scene.ngeom
             apart = float(np.linalg.norm(reference[:2] - qpos[:2]))
-            alpha = GHOST_ALPHA * float(np.clip(2.0 - apart / GHOST_FADE, 0.0, 1.0))
+            alpha = GHOST_ALPHA * float(np.clip(2.0 - apart / (GHOST_FADE * self._size), 0.0, 1.0))
             self._pose(reference)
             mujoco.mjv_addGeoms(self._model, self._data, self._option, perturbation, moving, scene)
             for geom in scene.geoms[solid : scene.ngeom]:
@@ -115,7 +117,7 @@ class Renderer:
                 geom.rgba[3] = alpha
         for light in scene.lights[: scene.nlight]:
             if not light.headlight:
-                light.pos[:] = camera.lookat + LIGHT_FROM
+                light.pos[:] = camera.lookat + LIGHT_FROM * self._size
         pixels = np.empty((self._rect.height, self._rect.width, 3), np.uint8)
         self._gl.make_current()
         mujoco.mjr_render(self._rect, scene, self._context)

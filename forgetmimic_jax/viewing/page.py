@@ -14,7 +14,7 @@ import numpy.typing as npt
 import viser
 from scipy.spatial.transform import Rotation
 
-from forgetmimic_jax.robot import Robot
+from forgetmimic_jax.robot import Robot, relative_height
 from forgetmimic_jax.viewing.offscreen import drawing_model
 from forgetmimic_jax.viewing.playback import Playback
 from forgetmimic_jax.viewing.shapes import UNIT_MESHES, Shapes, shapes
@@ -99,7 +99,8 @@ class Page:
             for i, name in enumerate(self._policies)
         ]
         camera = self._server.initial_camera
-        camera.position, camera.look_at = (3.4, -0.9, 1.5), (0.0, 0.0, 0.62)
+        size = relative_height(self._model)
+        camera.position, camera.look_at = size * np.array([3.4, -0.9, 1.5]), size * np.array([0.0, 0.0, 0.62])
 
     def _show(self, plots: bool) -> None:
         playback = self._playback

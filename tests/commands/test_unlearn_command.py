@@ -6,13 +6,14 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from miniature import load_state
+from miniature import TINY, finished, load_state
 from trees import assert_same
 
-from forgetmimic_jax import checkpoint, runner, unlearn
+from forgetmimic_jax import checkpoint, runner, train, unlearn
 from forgetmimic_jax.config import load_config
 from forgetmimic_jax.errors import Interrupted, run_command
 from forgetmimic_jax.evaluation import evaluate as evaluation
+from forgetmimic_jax.motion.library import DATA_DIR, read_manifest
 
 
 @pytest.fixture
@@ -347,3 +348,16 @@ def test_an_unknown_method_is_told(refused, options):
 def test_a_method_that_contradicts_the_run_to_resume_is_told(refused, unlearned_run):
     told = refused(unlearn.main, unlearn.Options(output=unlearned_run.folder, resume=True, method="retrain"))
     assert told == "--method: found retrain, but the run to resume has arft; leave the flag out"
+
+
+def test_another_robot_learns_forgets_and_is_evaluated_on_its_own_library(tmp_path):
+    """The H2: 31 joints, the ankle's the other way round, the head before the arms."""
+    base = finished(train.main, train.Options(robot="h2", output=tmp_path / "base", iterations=2, set=[TINY]))
+    asked = {"robot": "h2", "base": base.checkpoint(2), "iterations": 1, "episodes": 1}
+    run = finished(unlearn.main, unlearn.Options(**asked, output=tmp_path / "unlearned"))
+    document = json.loads((run.folder / "evaluation.json").read_text())
+    assert document["robot"] == "h2"
+    assert document["targets"] == ["punch", "kick"]
+    assert set(document["policies"]["unlearned"]["clips"]) == set(read_manifest(DATA_DIR / "h2")["clips"])
+    # A robot of 76 kg that stands where the reference stands lives for some steps.
+    assert document["policies"]["zero_action"]["kept"]["episode_length"]["mean"] > 5.0

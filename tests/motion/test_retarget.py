@@ -81,16 +81,17 @@ def test_an_unknown_clip_is_told(robot, tmp_path):
         recipe.retarget_library(robot, tmp_path, tmp_path / "out", ["backfip"])
 
 
-def test_shipped_clips_are_made_again_bit_for_bit(deepmimic, tmp_path):
+@pytest.mark.parametrize(("robot_name", "names"), [("g1", "run,kick"), ("h2", "kick")])
+def test_shipped_clips_are_made_again_bit_for_bit(deepmimic, tmp_path, robot_name, names):
     """A cyclic and a single one, by the command: what made the files is in the repository."""
     output = tmp_path / "again"
-    command = [sys.executable, "-m", "forgetmimic_jax.motions", "--robot", "g1", "retarget", "--clips", "run,kick"]
+    command = [sys.executable, "-m", "forgetmimic_jax.motions", "--robot", robot_name, "retarget", "--clips", names]
     done = subprocess.run(
         [*command, "--source", deepmimic, "--output", output], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    shipped = library.DATA_DIR / "g1"
+    shipped = library.DATA_DIR / robot_name
     again, entries = library.read_manifest(output)["clips"], library.read_manifest(shipped)["clips"]
-    for name in ("run", "kick"):
+    for name in names.split(","):
         assert (output / f"{name}.npz").read_bytes() == (shipped / f"{name}.npz").read_bytes()
         assert again[name] == entries[name]
