@@ -67,7 +67,7 @@ class TerminationConfig:
     orientation: float = 0.8  # difference of projected gravity's z, or rad with orientation_rule 'angle'
     orientation_rule: Literal["gravity_z", "angle"] = "gravity_z"
     end_effector_height: float = 0.25  # m
-    contact_force: float = 2000.0  # N
+    contact_force: float = 2000.0  # N for the G1, in proportion to the mass for another robot
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from forgetmimic_jax.errors import InputError, nearest
 ROBOTS_DIR = Path(__file__).resolve().parent.parent / "robots"
 CONTACT_SENSOR = "contact_"
 VISUAL_GROUP = 2  # the geom group of the shapes that are only seen
-G1_ROOT_HEIGHT = 0.793  # m, of the G1's pelvis in its MJCF
+G1_ROOT_HEIGHT, G1_MASS = 0.793, 33.341142  # m, of the G1's pelvis in its MJCF; kg
 
 
 @struct.dataclass
@@ -224,6 +224,11 @@ def read_spec(name: str, robots_dir: Path = ROBOTS_DIR) -> mujoco.MjSpec:
 def relative_height(model: mujoco.MjModel) -> float:
     """How tall a robot is beside the G1, by the height of its root in its MJCF: what views of it scale by."""
     return float(model.body_pos[1, 2]) / G1_ROOT_HEIGHT
+
+
+def relative_mass(model: mujoco.MjModel) -> float:
+    """How heavy a robot is beside the G1, to six digits."""
+    return round(float(model.body_subtreemass[1]) / G1_MASS, 6)
 
 
 def _read_roles(path: Path) -> dict[str, Any]:

@@ -175,6 +175,6 @@ def _judge(
     aligned = align_to_anchor(reference, anchor, bodies.pos[:, anchor], bodies.quat[:, anchor])
     joint_pos, joint_vel = jnp.asarray(steps["qpos"][:, 7:]), jnp.asarray(steps["qvel"][:, 6:])
     errors = reward.tracking_errors(reference, aligned, bodies, anchor, joint_pos, joint_vel)
-    causes = terminations(config.termination, reference, aligned, bodies, anchor, jnp.asarray(robot.end_effectors))
+    causes = terminations(config.termination, reference, aligned, bodies, robot)
     normalized = reward.tracking_reward(errors, config.reward)[1]
     return np.asarray(normalized), np.asarray(jnp.stack(list(causes.values())).any(0))

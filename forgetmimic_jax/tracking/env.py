@@ -213,8 +213,7 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
     result_reward = jax.tree.map(
         lambda value: jnp.where(diverged, 0.0, value), reward.Reward(tracking, regularisation, normalized, terms)
     )
-    end_effectors = jnp.asarray(robot.end_effectors)
-    causes = terminations(config.termination, reference, aligned, bodies, robot.anchor, end_effectors)
+    causes = terminations(config.termination, reference, aligned, bodies, robot)
     terminated = diverged | jnp.stack(list(causes.values())).any(0)
     steps = state.step + 1
     new = dataclasses.replace(

@@ -8,6 +8,7 @@ from jax import Array
 from forgetmimic_jax import rotation
 from forgetmimic_jax.config import TerminationConfig
 from forgetmimic_jax.physics import BodyState
+from forgetmimic_jax.robot import Robot, relative_mass
 from forgetmimic_jax.tracking.reference import AlignedBodies, Reference
 
 
@@ -16,10 +17,13 @@ def terminations(
     reference: Reference,
     aligned: AlignedBodies,
     bodies: BodyState,
-    anchor: int,
-    end_effectors: Array,
+    robot: Robot,
 ) -> dict[str, Array]:
-    """Which bound each environment breaks: name → bool [env]."""
+    """Which bound each environment breaks: name → bool [env].
+
+    That of the contact force, stated for the G1, grows with the robot's mass: a heavier one lands as much harder.
+    """
+    anchor, end_effectors = robot.anchor, jnp.asarray(robot.end_effectors)
     ref_quat, quat = reference.body_quat[:, anchor], bodies.quat[:, anchor]
     if config.orientation_rule == "gravity_z":
         # Projected gravity's z is minus the z of the body's up axis in the world, so yaw does not matter.
@@ -33,5 +37,5 @@ def terminations(
         "anchor_height": jnp.abs(reference.body_pos[:, anchor, 2] - bodies.pos[:, anchor, 2]) > config.anchor_height,
         "orientation": tilt > config.orientation,
         "end_effector_height": (heights > config.end_effector_height).any(-1),
-        "contact_force": (forces > config.contact_force).any(-1),
+        "contact_force": (forces > config.contact_force * relative_mass(robot.model)).any(-1),
     }

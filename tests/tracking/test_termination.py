@@ -7,6 +7,7 @@ from scene import on_reference, turned, upright_scene
 from scipy.spatial.transform import Rotation
 
 from forgetmimic_jax.config import TerminationConfig
+from forgetmimic_jax.robot import load_robot
 from forgetmimic_jax.tracking.reference import align_to_anchor, lookup
 from forgetmimic_jax.tracking.termination import terminations
 
@@ -15,8 +16,7 @@ LITERAL_ANGLE = TerminationConfig(orientation_rule="angle")
 
 def causes(robot, reference, bodies, config=TerminationConfig()) -> set[str]:  # noqa: B008 (a frozen dataclass)
     aligned = align_to_anchor(reference, robot.anchor, bodies.pos[:, robot.anchor], bodies.quat[:, robot.anchor])
-    end_effectors = jnp.asarray(robot.end_effectors)
-    result = terminations(config, reference, aligned, bodies, robot.anchor, end_effectors)
+    result = terminations(config, reference, aligned, bodies, robot)
     return {name for name, value in result.items() if bool(value[0])}
 
 
@@ -85,6 +85,14 @@ def test_contact_force_ends_beyond_2000_n_on_any_key_body(robot):
     for body in range(14):
         assert causes(robot, reference, pushed(bodies, body, (1199.0, 0.0, -1599.0))) == set()
         assert causes(robot, reference, pushed(bodies, body, (1201.0, 0.0, -1601.0))) == {"contact_force"}
+
+
+def test_the_contact_force_that_ends_an_episode_grows_with_the_robot_s_mass(robot):
+    # The H2 weighs 75.5875 kg, the G1 33.3411: 4534 N.
+    reference, bodies = upright_scene(robot)
+    h2 = dataclasses.replace(robot, model=load_robot("h2").model)
+    assert causes(h2, reference, pushed(bodies, 0, (0.0, 0.0, 4533.0))) == set()
+    assert causes(h2, reference, pushed(bodies, 0, (0.0, 0.0, 4535.0))) == {"contact_force"}
 
 
 def test_place_and_heading_end_nothing_by_themselves(robot, library):
