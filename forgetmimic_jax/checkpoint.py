@@ -165,17 +165,19 @@ def check_matches(
     config: Config,
     *,
     other_library: bool = False,
+    other_robot: bool = False,
     resume: bool = False,
 ) -> None:
     """Say which of robot, joints, library or network differs between a checkpoint and what is asked.
 
-    `other_library` accepts other clips: a policy may be trained on with them. `resume` needs the same environments and
+    `other_library` accepts other clips: a policy may be trained on with them; `other_robot` another robot: its policy
+    may be carried over. `resume` needs the same environments and
     bins too.
 
     Raises:
         InputError: something differs.
     """
-    if info.robot != robot.name or info.joints != robot.joint_names:
+    if not other_robot and (info.robot != robot.name or info.joints != robot.joint_names):
         raise InputError(f"{info.path}: robot: the checkpoint's is '{info.robot}' ({len(info.joints)} joints), asked "
                          f"for '{robot.name}' ({robot.num_joints} joints)")  # fmt: skip
     if not other_library and (info.clips != library.names or info.library_hash != library_hash):

@@ -23,6 +23,7 @@ from tensorboardX.proto.event_pb2 import Event, SessionLog
 from tensorboardX.proto.summary_pb2 import Summary
 
 from forgetmimic_jax import checkpoint
+from forgetmimic_jax.carried_over import policy_for
 from forgetmimic_jax.config import Config, save_config, validate
 from forgetmimic_jax.console import progress
 from forgetmimic_jax.errors import InputError, Interrupted, nearest
@@ -98,14 +99,21 @@ def start_state(setup: Setup) -> TrainState:
 def base_policy(setup: Setup) -> Policy:
     """The policy that a run starts from.
 
-    Training may go on with other clips than the base's; unlearning needs the base's own.
+    Training may go on with other clips than the base's, and with another robot's policy, carried over joint by joint;
+    unlearning needs the base's own.
 
     Raises:
-        InputError: the checkpoint is not of this robot, network or library.
+        InputError: the checkpoint is not of this robot, network or library, or of a robot that nothing can be had from.
     """
-    base, training = base_checkpoint(setup.config), not setup.config.unlearn.targets
+    config, robot = setup.config, setup.robot
+    base, training = base_checkpoint(config), not config.unlearn.targets
     info = checkpoint.read_info(base)
-    checkpoint.check_matches(info, setup.robot, setup.library, setup.library_hash, setup.config, other_library=training)
+    carry = training and info.robot != robot.name
+    checkpoint.check_matches(
+        info, robot, setup.library, setup.library_hash, config, other_library=training, other_robot=carry
+    )
+    if carry:
+        return policy_for(robot, base, config, template(setup))
     return checkpoint.load_policy(base, template(setup))
 
 

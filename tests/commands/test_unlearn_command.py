@@ -350,9 +350,11 @@ def test_a_method_that_contradicts_the_run_to_resume_is_told(refused, unlearned_
     assert told == "--method: found retrain, but the run to resume has arft; leave the flag out"
 
 
-def test_another_robot_learns_forgets_and_is_evaluated_on_its_own_library(tmp_path):
+def test_another_robot_learns_from_the_first_forgets_and_is_evaluated_on_its_own_library(base_run, tmp_path):
     """The H2: 31 joints, the ankle's the other way round, the head before the arms."""
-    base = finished(train.main, train.Options(robot="h2", output=tmp_path / "base", iterations=2, set=[TINY]))
+    start = base_run.checkpoint(4)
+    given = train.Options(robot="h2", base=start, output=tmp_path / "base", iterations=2, set=[TINY])
+    base = finished(train.main, given)
     asked = {"robot": "h2", "base": base.checkpoint(2), "iterations": 1, "episodes": 1}
     run = finished(unlearn.main, unlearn.Options(**asked, output=tmp_path / "unlearned"))
     document = json.loads((run.folder / "evaluation.json").read_text())
