@@ -28,7 +28,7 @@ class Options:
     library: Path | None = None
     """Folder of clips; data/ROBOT by default."""
     base: Path | None = None
-    """Checkpoint whose policy to start from; a random policy by default."""
+    """Checkpoint whose policy to start from, another robot's too; a random policy by default."""
     output: Path | None = None
     """Folder of the run; runs/train-ROBOT by default."""
     resume: bool = False
