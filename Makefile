@@ -25,14 +25,17 @@ ROBOT ?= g1
 
 MODULE = .venv/bin/python -m forgetmimic_jax
 flag = $(if $($(2)),--$(1) $($(2)))
-ROBOT_FLAGS = --robot $(ROBOT) $(call flag,physics,PHYSICS) $(call flag,library,LIBRARY)
+WHERE_FLAGS = $(call flag,physics,PHYSICS) $(call flag,library,LIBRARY)
+ROBOT_FLAGS = --robot $(ROBOT) $(WHERE_FLAGS)
 RUN_FLAGS = $(ROBOT_FLAGS) $(call flag,seed,SEED) $(call flag,output,OUTPUT)
 TRAIN_FLAGS = $(RUN_FLAGS) $(call flag,preset,PRESET) $(call flag,iterations,ITERATIONS) $(call flag,base,BASE) \
 	$(if $(RESUME),--resume)
 TARGET_FLAGS = $(call flag,targets,TARGETS) $(call flag,episodes,EPISODES)
-STUDY_FLAGS = $(ROBOT_FLAGS) $(call flag,base,BASE) $(TARGET_FLAGS) $(call flag,budget,PRESET) \
-	$(call flag,iterations,ITERATIONS)
-STUDIES = validity comparison penalty heat_map motion_types physical_behaviour training_dynamics relearning membership
+# A study has a robot of its own, the G1 but for one, unless another is asked for.
+STUDY_FLAGS = $(if $(filter-out g1,$(ROBOT)),--robot $(ROBOT)) $(WHERE_FLAGS) $(call flag,base,BASE) $(TARGET_FLAGS) \
+	$(call flag,budget,PRESET) $(call flag,iterations,ITERATIONS)
+STUDIES = validity comparison penalty heat_map motion_types physical_behaviour training_dynamics relearning membership \
+	number_of_targets
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
@@ -89,7 +92,10 @@ bench: .venv/.installed ## steps per second of training on this machine
 tables: .venv/.installed ## rewrite the README's tables and the studies' pages from the stored numbers alone
 	$(MODULE).evaluation.tables README.md
 	@for study in $(STUDIES); do \
-		test ! -f experiments/results/$$study.json || .venv/bin/python -m experiments.$$study --draw || exit; \
+		for robot in $(notdir $(wildcard robots/*)); do \
+			test ! -f experiments/results/$$robot/$$study.json || \
+				.venv/bin/python -m experiments.$$study --robot $$robot --draw || exit; \
+		done; \
 	done
 	.venv/bin/python -m experiments.claims
 

@@ -129,12 +129,13 @@ def of_heat_map(document: Mapping[str, Any]) -> Iterator[Finding]:
 
 
 def of_motion_types(document: Mapping[str, Any]) -> Iterator[Finding]:
-    """Fig. 4: any motion."""
+    """Fig. 4 and the H2's table: any motion, and any number of them."""
     for label, variant in document["results"]["variants"].items():
         skill = variant["over_seeds"]["policy"]["target"].get("skill")
         if skill:
             evidence = f"{percent(skill)} of the skill is left"
-            yield Finding(f"{label} can be forgotten", judged(skill, FORGOTTEN), evidence)
+            claim = f"{label} can be forgotten on the {document['asked']['robot'].upper()}"
+            yield Finding(claim, judged(skill, FORGOTTEN), evidence)
 
 
 def of_physical_behaviour(document: Mapping[str, Any]) -> Iterator[Finding]:
@@ -178,14 +179,15 @@ def of_membership(document: Mapping[str, Any]) -> Iterator[Finding]:
 
 
 JUDGES: dict[str, Callable[[Mapping[str, Any]], Iterator[Finding]]] = {
-    "validity": of_validity,
-    "comparison": of_comparison,
-    "penalty": of_penalty,
-    "heat_map": of_heat_map,
-    "motion_types": of_motion_types,
-    "physical_behaviour": of_physical_behaviour,
-    "relearning": of_relearning,
-    "membership": of_membership,
+    "g1/validity": of_validity,
+    "g1/comparison": of_comparison,
+    "g1/penalty": of_penalty,
+    "g1/heat_map": of_heat_map,
+    "g1/motion_types": of_motion_types,
+    "h2/number_of_targets": of_motion_types,
+    "g1/physical_behaviour": of_physical_behaviour,
+    "g1/relearning": of_relearning,
+    "g1/membership": of_membership,
 }
 
 
@@ -204,12 +206,12 @@ def table(folder: Path = RESULTS, judges: Mapping[str, Callable] = JUDGES) -> st
     for study, judge in judges.items():
         path = folder / f"{study}.json"
         if not path.is_file():
-            missing.append(study)
+            missing.append(Path(study).name)
             continue
         document = json.loads(path.read_text())
         seeds = document["asked"]["seeds"]
         rows += [
-            [f"[{study}](results/{study}.md)", of.claim, f"**{of.verdict}**", of.evidence, str(seeds)]
+            [f"[{Path(study).name}](results/{study}.md)", of.claim, f"**{of.verdict}**", of.evidence, str(seeds)]
             for of in judge(document)
         ]
     text = markdown_table(["study", "claim", "here", "evidence", "seeds"], rows) if rows else ""

@@ -67,7 +67,7 @@ class Options:
     library: Path | None = None
     """Folder of clips; the base's by default."""
     output: Path | None = None
-    """Folder for NAME.json, NAME.md, NAME.png and NAME.svg; experiments/results by default."""
+    """Folder for NAME.json, NAME.md, NAME.png and NAME.svg; experiments/results/ROBOT by default."""
     draw: bool = False
     """Only write page and figure again, from the JSON."""
     set: Settings = field(default_factory=list)
@@ -264,7 +264,7 @@ def conduct(study: Study, options: Options, next_command: str) -> None:
     """Measure what the JSON does not hold already, and tell it; exit code 1 where a trial failed."""
     from forgetmimic_jax import runner
 
-    folder = options.output or RESULTS
+    folder = options.output or RESULTS / options.robot
     runner.check_writable(folder)
     path = folder / f"{study.name}.json"
     document = _read(path)

@@ -62,7 +62,9 @@ def lambda_study(penalties: tuple[str, ...] = PENALTIES, name: str = "lambda") -
     )
 
 
-def targets_study(groups: tuple[str, ...] = GROUPS, name: str = "targets") -> Study:
+def targets_study(
+    groups: tuple[str, ...] = GROUPS, name: str = "targets", title: str = "Other motions as targets"
+) -> Study:
     """Other clips to forget."""
 
     def variants(lab: Lab) -> dict[str, dict[str, Any]]:
@@ -75,7 +77,7 @@ def targets_study(groups: tuple[str, ...] = GROUPS, name: str = "targets") -> St
 
     return variants_study(
         name,
-        "Other motions as targets",
+        title,
         variants,
         {},
         asks=list(groups),

@@ -17,7 +17,7 @@ from forgetmimic_jax.options import parse
 
 STUDIES = (
     *("validity", "comparison", "penalty", "heat_map", "motion_types", "physical_behaviour", "training_dynamics"),
-    *("relearning", "membership"),
+    *("relearning", "membership", "number_of_targets"),
 )
 
 
@@ -236,7 +236,8 @@ def test_every_study_comes_to_its_page_and_figure(name, base_run, watched_run, t
 
     monkeypatch.setattr(trials, "run_trials", stand_in)
     module = importlib.import_module(f"experiments.{name}")
-    subject = sweep.targets_study(("turn", "nod"), name) if name == "motion_types" else module.STUDY
+    other_clips = name in ("motion_types", "number_of_targets")
+    subject = sweep.targets_study(("turn", "nod"), name, module.STUDY.title) if other_clips else module.STUDY
     given = options(study.Options, base_run, tmp_path)
     run = finished(lambda given: study.conduct(subject, given, "make experiments"), given)
     out = tmp_path / "out"

@@ -93,7 +93,8 @@ def test_the_table_names_what_is_not_measured(tmp_path):
     skill = over_seeds([0.1, 0.12, 0.11])
     runs["over_seeds"] = {"policy": {"target": {"success_rate": success, "skill": skill}}}
     document = {"asked": {"seeds": 3}, "results": {"variants": {"λ = 16": runs}}}
-    (tmp_path / "validity.json").write_text(json.dumps(document))
+    (tmp_path / "g1").mkdir()
+    (tmp_path / "g1" / "validity.json").write_text(json.dumps(document))
     text = claims.table(tmp_path)
     rows = [line for line in text.splitlines() if line.startswith("| [validity]")]
     assert len(rows) == 3

@@ -1,0 +1,24 @@
+"""Does it matter how many clips are to be forgotten? One, two and three on the Unitree H2 (paper, its H2 table)"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from forgetmimic_jax.study import Options, main
+from forgetmimic_jax.sweep import targets_study
+
+GROUPS = ("dance_a", "punch,kick", "jump,spinkick,cartwheel")  # dance, combat and acrobatics, as in the paper
+
+
+@dataclass(kw_only=True)
+class H2Options(Options):
+    """Run what is missing of a study, then write its JSON, its page and its figure."""
+
+    robot: str = "h2"
+    """Robot under robots/."""
+
+
+STUDY = targets_study(GROUPS, name="number_of_targets", title="How many motions at once?")
+
+if __name__ == "__main__":
+    main(STUDY, H2Options)
