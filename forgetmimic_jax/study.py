@@ -368,7 +368,7 @@ def main(study: Study, options: type[Options] = Options, arguments: Iterable[str
     given = tyro.cli(
         options,
         prog=program,
-        description=f"{study.title}. {Options.__doc__}",
+        description=f"{study.title}{'' if study.title.endswith('?') else '.'} {Options.__doc__}",
         args=None if arguments is None else list(arguments),
         config=(tyro.conf.FlagCreatePairsOff,),
     )
