@@ -142,13 +142,15 @@ def of_physical_behaviour(document: Mapping[str, Any]) -> Iterator[Finding]:
     """Fig. 6: forgotten, or sabotaged?"""
     policies = document["results"]["policies"]
     length = {label: [np.mean(run["episode_length"]) for run in runs.values()] for label, runs in policies.items()}
-    floor = float(np.mean(length["zero action"]))
+    base, floor = (float(np.mean(length[label])) for label in ("base", "zero action"))
     for label in ("λ = 8", "λ = 16"):
         if label in length:
             found = statistics.over_seeds(length[label])
-            evidence = f"target episodes last {number(found, 1)} steps, {floor:.1f} without a policy"
+            evidence = f"target episodes last {number(found, 1)} steps, the base's {base:.1f}, without a policy {floor:.1f}"
             claim = f"{label}: short episodes mean a lost skill, and not an episode ended on purpose"
-            yield Finding(claim, judged(found, floor - SOONER, below=False), evidence)
+            short = found["mean"] < 0.5 * (base + floor)
+            verdict = judged(found, floor - SOONER, below=False) if short else "not short"
+            yield Finding(claim, verdict, evidence)
 
 
 def of_relearning(document: Mapping[str, Any]) -> Iterator[Finding]:

@@ -74,7 +74,7 @@ def draw(document: Mapping[str, Any]) -> Figure:
         axes.violinplot(
             [np.concatenate([run[name] for run in of.values()]) for of in policies.values()], showmeans=True
         )
-        axes.set_xticks(range(1, len(policies) + 1), list(policies))
+        axes.set_xticks(range(1, len(policies) + 1), list(policies), fontsize="small", rotation=20)
         axes.set_title(f"{name.replace('_', ' ')}, {UNITS.get(name, 'm')}", fontsize="medium")
     return figure
 

@@ -65,12 +65,16 @@ def test_the_comparisons_claims_by_hand():
 
 def test_a_policy_that_falls_sooner_than_doing_nothing_has_not_lost_a_skill():
     policies = {
+        "base": {"0": {"episode_length": [60.0, 64.0]}},
         "zero action": {"0": {"episode_length": [16.0, 18.0]}},
         "λ = 8": {str(seed): {"episode_length": [17.0, 17.0 + seed]} for seed in range(3)},
         "λ = 16": {str(seed): {"episode_length": [5.0, 6.0 + seed]} for seed in range(3)},
     }
     found = [of.verdict for of in claims.of_physical_behaviour({"results": {"policies": policies}})]
     assert found == ["holds", "does not hold"]
+    policies["λ = 8"] = {"0": {"episode_length": [50.0, 52.0]}}
+    found = [of.verdict for of in claims.of_physical_behaviour({"results": {"policies": policies}})]
+    assert found == ["not short", "does not hold"]
 
 
 def test_what_comes_back_sooner_than_it_is_learned_was_not_forgotten():
