@@ -146,11 +146,11 @@ def of_physical_behaviour(document: Mapping[str, Any]) -> Iterator[Finding]:
     for label in ("λ = 8", "λ = 16"):
         if label in length:
             found = statistics.over_seeds(length[label])
-            evidence = f"target episodes last {number(found, 1)} steps, the base's {base:.1f}, without a policy {floor:.1f}"
+            steps = f"{number(found, 1)} steps, the base's {base:.1f}, without a policy {floor:.1f}"
             claim = f"{label}: short episodes mean a lost skill, and not an episode ended on purpose"
             short = found["mean"] < 0.5 * (base + floor)
             verdict = judged(found, floor - SOONER, below=False) if short else "not short"
-            yield Finding(claim, verdict, evidence)
+            yield Finding(claim, verdict, f"target episodes last {steps}")
 
 
 def of_relearning(document: Mapping[str, Any]) -> Iterator[Finding]:
