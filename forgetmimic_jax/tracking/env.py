@@ -76,7 +76,7 @@ class Environment:
 
     config: Config
     robot: Robot
-    engine: Engine
+    engine: Engine  # lives a control step at a time; with the wrench a physics step
     num_envs: int
     noisy: bool  # reset noise, pushes, randomisation and observation noise
 
@@ -91,7 +91,9 @@ class Environment:
 
 def make_environment(config: Config, robot: Robot, num_envs: int, *, noisy: bool | None = None) -> Environment:
     """An environment of `num_envs` robots; `noisy` defaults to the config's."""
-    engine = make_engine(robot, config.physics, num_envs)
+    assisted = config.wrench.max_gain > 0
+    physics = dataclasses.replace(config.physics, substeps=1) if assisted else config.physics  # see `_live`
+    engine = make_engine(robot, physics, num_envs)
     return Environment(config, robot, engine, num_envs, config.noise.enabled if noisy is None else noisy)
 
 
@@ -179,7 +181,6 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
     reference = lookup(assets.library, state.clip, state.frame + 1)
     # The joint controller regulates what its encoders read, so their bias moves the robot, not the reading.
     target = reference.joint_pos + assets.robot.action_scale * action - state.encoder_bias
-    wrench = assist(env, assets, state) if config.wrench.max_gain > 0 else jnp.zeros((env.num_envs, 6), jnp.float32)
 
     physics, countdown = state.physics, state.push_countdown
     if env.noisy:
@@ -190,7 +191,7 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
         interval = randomise.push_interval(config.noise, interval_key, env.num_envs, env.control_step)
         countdown = jnp.where(due, interval, countdown) - 1
 
-    physics, bodies = env.engine.step(physics, state.parameters, target, wrench)
+    physics, bodies = _live(env, assets, dataclasses.replace(state, physics=physics), target)
     diverged = ~_all_sane((physics, bodies), env.num_envs)
     # A diverged robot shows as standing where it was, so that no NaN can reach a sum; it is reset right after.
     physics, bodies = (_where(diverged, old, new) for old, new in ((state.physics, physics), (state.bodies, bodies)))
@@ -229,6 +230,25 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
     )
     truncated = (steps >= state.horizon) & ~terminated
     return new, StepResult(result_reward, terminated, truncated, diverged, causes, reference)
+
+
+def _live(env: Environment, assets: Assets, state: EnvState, target: Array) -> tuple[PhysicsState, BodyState]:
+    """One control step of the physics.
+
+    The wrench is that of each physics step. Its torque is for the inertia of the whole robot and acts on the torso
+    alone, so its damping, held for a control step, would overshoot and tear the robot apart.
+    """
+    if env.config.wrench.max_gain == 0:
+        nothing = jnp.zeros((env.num_envs, 6), jnp.float32)
+        return env.engine.step(state.physics, state.parameters, target, nothing)
+
+    def physics_step(state: EnvState, _: None) -> tuple[EnvState, None]:
+        wrench = assist(env, assets, state)
+        physics, bodies = env.engine.step(state.physics, state.parameters, target, wrench)
+        return dataclasses.replace(state, physics=physics, bodies=bodies), None
+
+    state, _ = jax.lax.scan(physics_step, state, length=env.config.physics.substeps)
+    return state.physics, state.bodies
 
 
 def observe(env: Environment, assets: Assets, state: EnvState, key: Array | None) -> tuple[Array, Array]:
