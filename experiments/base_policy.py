@@ -87,9 +87,10 @@ the acceleration that no contact with the floor gives (the largest mean over 0.2
   human's, {turned_most}'s most ({degrees_most:.1f}).
 - In the few million steps since, that was not enough. Spin and backflip mostly end about their take-off and dance_a in
   the first half of its cycle, with an end effector out of its height. Of no use there, in a million steps or two each:
-  the assistive wrench (the policy lost every clip to it; but it was unstable at its full gain then, see
-  [method.md](../docs/method.md#assistive-wrench), and has not been tried again), an end-effector bound of 0.45 m in training, twice the
-  exploration noise, and more of the starts. A run on dance_a and spin alone improved dance_a, slowly.
+  an end-effector bound of 0.45 m in training, twice the exploration noise, and more of the starts. With the assistive
+  wrench the policy lost every clip, but the wrench was unstable at its full gain then
+  ([method.md](../docs/method.md#assistive-wrench)); it has not been tried again. A run on dance_a and spin alone
+  improved dance_a, slowly.
 - Not that they are held back by the others: where an anchor (`ppo.anchor`) holds every other clip to the base and
   these, with the kick, may move five times as fast, two million steps gain the kick a tenth and the others little, and
   cost nothing (the base's last stage); four million more, or two million with another seed, gained nothing further.

@@ -275,8 +275,8 @@ def test_resets_start_new_episodes_where_asked_and_only_there(puppet_env, assets
     np.testing.assert_array_equal(after.start_bin[::2], 1)
     assert ((after.frame[::2] >= assets.bins.start[1, 1]) & (after.frame[::2] < assets.bins.end[1, 1])).all()
     np.testing.assert_allclose(after.wrench_gain[::2], 0.4)
-    for field in ("step", "tracking_sum", "last_action"):
-        assert not np.asarray(getattr(after, field))[::2].any()
+    for name in ("step", "tracking_sum", "last_action"):
+        assert not np.asarray(getattr(after, name))[::2].any()
     np.testing.assert_array_equal(after.horizon[::2], 40 - after.frame[::2])
 
 
