@@ -12,6 +12,7 @@ import numpy as np
 from forgetmimic_jax.motion import quality
 from forgetmimic_jax.motion.library import DATA_DIR, read_library, read_manifest
 from forgetmimic_jax.robot import load_robot
+from forgetmimic_jax.rows import read_rows
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -134,8 +135,7 @@ def going_on() -> str:
     """The second table, from the stored evaluations."""
     rows = ["| trial | from | settings | evaluations |", "|---|---|---|---|"]
     for name, (start, settings) in GOING_ON.items():
-        lines = (RESULTS / f"going_on_{name}.jsonl").read_text().splitlines()
-        evaluations = [json.loads(line) for line in lines]
+        evaluations = read_rows(RESULTS / f"going_on_{name}.jsonl")
         steps_per_iteration = LONG_ITERATIONS.get(name, 4096)
         cells = [
             f"{row['iteration'] * steps_per_iteration / 1e6:.1f} M: {row['survival_weighted_tracking']:.2f} "
@@ -192,7 +192,7 @@ def lengths(first: str, trials: dict[str, str]) -> str:
 
 def curve(name: str) -> tuple[np.ndarray, np.ndarray]:
     """Environment steps and mean episode length of a stored trial."""
-    rows = [json.loads(line) for line in (RESULTS / f"{name}.jsonl").read_text().splitlines()]
+    rows = read_rows(RESULTS / f"{name}.jsonl")
     return np.array([row["environment_steps"] for row in rows]), np.array([row["episode_length"] for row in rows])
 
 

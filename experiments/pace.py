@@ -59,8 +59,8 @@ TEXT = """# Unlearning's pace on a laptop
 On the shipped base, of 54.3 M steps.
 
 {shipped}
-- At 240 iterations both seeds keep a sixth of the kick or more, whatever is done to hurry. Larger steps and more epochs
-  are paid for by the cartwheel. So the default is 320.
+- At 240 iterations more of the targets is left than at 320, whatever is done to hurry; larger steps and more epochs are
+  paid for by the kept clips. So the default is 320.
 
 ## Anchor and equal clips
 

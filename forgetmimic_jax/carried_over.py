@@ -33,10 +33,13 @@ def policy_for(robot: Robot, path: Path, config: Config, template: TrainState) -
         template: shapes of its state.
 
     Raises:
-        InputError: the robots have no joint, or not as many key bodies, in common.
+        InputError: the robots have no joint, or not as many key bodies, in common, or the source has changed.
     """
-    name = checkpoint.read_info(path).robot
+    info = checkpoint.read_info(path)
+    name = info.robot
     source = load_robot(name)
+    if info.joints != source.joint_names:
+        raise InputError(f"{path}: joints: not those of robots/{name} today, in their order")
     found, needed = len(source.key_bodies), len(robot.key_bodies)
     if found != needed:
         raise InputError(f"{path}: key_bodies: '{name}' has {found}; {needed} are needed, as '{robot.name}' has")

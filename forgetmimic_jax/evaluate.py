@@ -67,7 +67,8 @@ def main(options: Options) -> None:
         seed=options.seed,
         budget={name: cost(info) for name, info in compared.info.items()},
     )
-    closing(show_and_write(output, document), f"make unlearn ROBOT={options.robot}")
+    base = f" BASE={options.checkpoint}" if options.checkpoint and not compared.targets else ""
+    closing(show_and_write(output, document), f"make unlearn ROBOT={options.robot}{base}")
 
 
 if __name__ == "__main__":

@@ -308,10 +308,11 @@ def _watch(setup: Setup, directory: Path, iteration: int) -> Watch | None:
 
 
 def _steps_before(config: Config) -> int:
-    """Environment steps that a base's training adds to those of the training that goes on from it."""
+    """Environment steps that a base's training adds to those of the training that goes on from it on the same robot."""
     if config.base is None or config.unlearn.targets:
         return 0
-    return checkpoint.read_info(Path(config.base)).environment_steps
+    info = checkpoint.read_info(Path(config.base))
+    return info.environment_steps if info.robot == config.robot else 0
 
 
 def _saved_state(setup: Setup, path: Path) -> tuple[TrainState, int]:

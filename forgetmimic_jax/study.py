@@ -116,6 +116,9 @@ class Lab:
         self.options, self.iterations = options, iterations
         self.base = options.base or runner.base_folder(options.robot)
         self.info = checkpoint.read_info(self.base)
+        robot = self.info.robot
+        if robot != options.robot:
+            raise InputError(f"{self.base}: robot: the checkpoint's is '{robot}', asked for '{options.robot}'")
         self.config: Config = replace_given(self.info.config, library=options.library)
         self.targets = (
             runner.default_targets(self.config) if options.targets is None else comma_separated(options.targets)
@@ -169,12 +172,16 @@ class Lab:
         together = [*itertools.chain(*options.set), *variant.get("set", [])]
         return make_trial(options.trials, asked | dict(variant) | ({"set": together} if together else {}))
 
-    def run(self, variants: Mapping[K, Mapping[str, Any]], what: str) -> dict[K, Path]:
+    def run(self, variants: Mapping[K, Mapping[str, Any]], what: str, *, others: bool = False) -> dict[K, Path]:
         """Train and evaluate what differs from the default unlearning run as told; the folders of those that finished.
 
         Args:
             variants: by any key; see `trial`.
             what: is being done, for the progress line.
+            others: trials beside these are finished already.
+
+        Raises:
+            InputError: every trial failed, and there are no others.
         """
         from forgetmimic_jax.trials import run_trials
 
@@ -182,7 +189,7 @@ class Lab:
         failed = run_trials(list(trials.values()), jobs=self.options.jobs, description=what)
         self.failed |= {trial.folder.name: reason for trial, reason in failed.items()}
         finished = {key: trial.folder for key, trial in trials.items() if trial not in failed}
-        if not finished:
+        if not finished and not others:
             raise InputError(f"{what}: every trial failed; the first: {next(iter(failed.values()))}")
         return finished
 
@@ -201,7 +208,7 @@ class Lab:
         options = {(label, seed): {**variants[label], "seed": seed} for label, seed in asked}
         names = {key: self.trial(variant).folder.name for key, variant in options.items()}
         missing = {key: variant for key, variant in options.items() if names[key] not in self.known}
-        folders = self.run(missing, what) if missing else {}
+        folders = self.run(missing, what, others=len(missing) < len(options)) if missing else {}
         result = {}
         for label, variant in variants.items():
             runs = {
@@ -255,9 +262,10 @@ def newest_policy(folder: Path) -> Path:
 
 def known_trials(folder: Path) -> dict[str, Any]:
     """What the studies in a folder say of the trials of their variants, by the trial's name."""
-    documents = [_read(path) or {} for path in sorted(folder.glob("*.json"))]
-    variants = [of for document in documents for of in document.get("results", {}).get("variants", {}).values()]
-    return {name: of["seeds"][seed] for of in variants for seed, name in of["trials"].items()}
+    documents = [_read(path) for path in sorted(folder.glob("*.json"))]
+    studies = [document for document in documents if isinstance(document, dict) and "study" in document]
+    variants = [of for study in studies for of in study["results"].get("variants", {}).values()]
+    return {name: of["seeds"][seed] for of in variants for seed, name in of.get("trials", {}).items()}
 
 
 def conduct(study: Study, options: Options, next_command: str) -> None:
@@ -303,11 +311,14 @@ def _read(path: Path) -> dict[str, Any] | None:
 def page(study: Study, document: Mapping[str, Any]) -> str:
     """The whole page in Markdown."""
     asked = document["asked"]
+    variants = document["results"].get("variants", {}).values()
+    own_targets = any("targets" in variant["options"] for variant in variants)
+    targets = "" if own_targets else f"; targets {', '.join(asked['targets'])}"
     lines = [
         f"# {study.title}",
         "",
-        f"- Robot {asked['robot']}; base trained for {asked['base_environment_steps']:,} environment steps; targets "
-        f"{', '.join(asked['targets'])}.",
+        f"- Robot {asked['robot']}; base trained for {asked['base_environment_steps']:,} environment steps"
+        f"{targets}.",
         f"- {asked['iterations']:,} iterations a trial with the {asked['budget']} budget, {asked['seeds']} seed(s), "
         f"{asked['episodes']} episodes a clip.",
         "- In square brackets: the 95 % interval over seeds (Student's t); the seed is the unit. One seed has none.",

@@ -39,7 +39,7 @@ class Options(StudyOptions):
     values: list[str] = field(default_factory=list)
     """Penalties (by default 0.5 1 4 6 7 8 9 12 16), groups of targets (punch,kick dance_a,dance_b run) or samplers."""
     output: Path | None = None
-    """Folder for KIND.json, KIND.md, KIND.png and KIND.svg; runs/sweep-KIND by default."""
+    """Folder for KIND.json, KIND.md, KIND.png and KIND.svg; runs/sweep-ROBOT-KIND by default."""
 
 
 def lambda_study(penalties: tuple[str, ...] = PENALTIES, name: str = "lambda") -> Study:
@@ -71,6 +71,9 @@ def targets_study(
         from forgetmimic_jax.runner import check_targets
 
         asked = [comma_separated(group) for group in groups]
+        if groups == GROUPS:  # as far as the robot's library has them
+            there = [tuple(clip for clip in targets if clip in lab.info.clips) for targets in asked]
+            asked = [targets for targets in there if targets]
         for targets in asked:
             check_targets(targets, lab.info.clips)
         return {" + ".join(targets): {"targets": ",".join(targets)} for targets in asked}
@@ -205,7 +208,7 @@ def _draw_targets(variants: Mapping[str, Any]) -> Figure:
 
 def main(options: Options) -> None:
     """Run the sweep."""
-    options.output = options.output or Path("runs") / f"sweep-{options.kind}"
+    options.output = options.output or Path("runs") / f"sweep-{options.robot}-{options.kind}"
     make = STUDIES[options.kind]
     conduct(make(tuple(options.values)) if options.values else make(), options, "make experiments")
 

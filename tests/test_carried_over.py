@@ -1,6 +1,8 @@
 """The G1's policy on the H2: the same action for the same joints, whatever the order they stand in."""
 
 import dataclasses
+import json
+import shutil
 
 import jax
 import jax.numpy as jnp
@@ -143,6 +145,15 @@ def test_a_joint_that_only_the_source_has_is_left_out(robot, h2, theirs, carried
                            strict=True):  # fmt: skip
         np.testing.assert_array_equal(here, there)
     np.testing.assert_allclose(back.actor_normalizer.mean, theirs.actor_normalizer.mean, rtol=1e-5, atol=1e-6)
+
+
+def test_a_checkpoint_of_a_robot_that_has_changed_since_is_told(h2, tmp_path):
+    folder = tmp_path / "base"
+    shutil.copytree(DATA_DIR / "g1" / "base", folder)
+    meta = json.loads((folder / "meta.json").read_text())
+    (folder / "meta.json").write_text(json.dumps({**meta, "joints": meta["joints"][::-1]}))
+    with pytest.raises(InputError, match="base: joints: not those of robots/g1 today"):
+        policy_for(h2, folder, TINY, None)
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ import numpy as np
 from forgetmimic_jax.errors import InputError
 from forgetmimic_jax.robot import VISUAL_GROUP, read_spec, relative_height
 
-# Distances are for a robot of the G1's height; for another they scale.
+# Distances are for a robot of the G1's height; for another those of this file scale.
 GHOST_ALPHA = 0.2
 GHOST_FADE = 0.8  # m from the robot, from where the ghost pales; at twice that it is gone, lest it hide the robot
 GHOST_TINT = np.array([0.25, 0.65, 0.45])  # what the reference's colours are mixed with, half and half

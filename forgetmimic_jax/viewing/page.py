@@ -22,6 +22,7 @@ from forgetmimic_jax.viewing.shapes import UNIT_MESHES, Shapes, shapes
 PICTURES_PER_SECOND, PLOTS_PER_SECOND = 25.0, 5.0
 LANE = (2.6, 2.0)  # length and width of a robot's piece of floor, m; the robot stays in its middle
 LANE_GAP, LINE_SPACING = 0.2, 0.5  # m
+LABEL_HEIGHT = 1.62  # m above the floor, over the head of the G1
 GHOST_OPACITY, GHOST_SHARE, GHOST_TINT = 0.3, 0.5, np.array([64, 166, 115])
 GHOST_REACH = 1.2  # m from the robot, beyond which the reference is hidden: it would stand on another's floor
 FLOOR, LINE, RED = (205, 211, 219), (168, 177, 189), (214, 30, 40)
@@ -94,12 +95,12 @@ class Page:
     def _build_scene(self, robot: Mapping[str, Shapes]) -> None:
         scene = self._server.scene
         scene.set_background_image(np.full((1, 1, 3), 244, np.uint8))
+        size = relative_height(self._model)
+        middle, apart, height = (len(self._policies) - 1) / 2.0, LANE[1] + LANE_GAP, LABEL_HEIGHT * size
         self._lanes = [
-            _Lane(scene, name, robot, (i - (len(self._policies) - 1) / 2.0) * (LANE[1] + LANE_GAP))
-            for i, name in enumerate(self._policies)
+            _Lane(scene, name, robot, (i - middle) * apart, height) for i, name in enumerate(self._policies)
         ]
         camera = self._server.initial_camera
-        size = relative_height(self._model)
         camera.position, camera.look_at = size * np.array([3.4, -0.9, 1.5]), size * np.array([0.0, 0.0, 0.62])
 
     def _show(self, plots: bool) -> None:
@@ -204,7 +205,7 @@ class Page:
 class _Lane:
     """One policy's piece of floor with its robot in the middle, whose ways the lines on the floor show."""
 
-    def __init__(self, scene: viser.SceneApi, name: str, robot: Mapping[str, Shapes], y: float):
+    def __init__(self, scene: viser.SceneApi, name: str, robot: Mapping[str, Shapes], y: float, height: float):
         root = f"/{name}"
         length, width = LANE
         scene.add_frame(root, show_axes=False, position=(0.0, y, 0.0))
@@ -225,7 +226,7 @@ class _Lane:
         border = np.stack([corners, np.roll(corners, 1, axis=0)], axis=1)
         self._alarm = scene.add_line_segments(f"{root}/alarm", border, RED, thickness=0.05, visible=False)
         self._label = scene.add_label(
-            f"{root}/label", name, position=(0.0, 0.0, 1.62), anchor="bottom-center", font_screen_scale=1.4
+            f"{root}/label", name, position=(0.0, 0.0, height), anchor="bottom-center", font_screen_scale=1.4
         )
         self._name = name
         self._world = scene.add_frame(f"{root}/world", show_axes=False)

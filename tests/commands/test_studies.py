@@ -134,6 +134,28 @@ def test_a_further_seed_runs_alone_where_the_numbers_of_the_others_are_stored(sw
     assert extended["over_seeds"]["policy"]["kept"]["episode_length"]["n"] == 3
 
 
+def test_a_further_seed_that_fails_leaves_the_others_and_is_told(swept, base_run, monkeypatch, tmp_path):
+    shutil.copy(swept[0] / "out" / "seeds.json", tmp_path)
+    monkeypatch.setattr(trials, "run_trials", lambda asked, **_: dict.fromkeys(asked, "no luck"))
+    given = {"seeds": 3, "trials": tmp_path / "trials", "output": tmp_path}
+    with pytest.raises(SystemExit) as exit_:
+        sweep.main(options(sweep.Options, base_run, tmp_path, kind="seeds", **given))
+    assert exit_.value.code == 1
+    document = json.loads((tmp_path / "seeds.json").read_text())
+    assert list(document["results"]["variants"]["λ = 16"]["seeds"]) == ["0", "1"]
+    assert list(document["failed"].values()) == ["no luck"]
+
+
+def test_what_tells_of_no_trials_is_passed_over(tmp_path):
+    (tmp_path / "list.json").write_text("[1]")
+    (tmp_path / "other.json").write_text('{"results": [1]}')
+    (tmp_path / "old.json").write_text('{"study": "old", "results": {"variants": {"a": {"seeds": {"0": {}}}}}}')
+    (tmp_path / "new.json").write_text(
+        '{"study": "new", "results": {"variants": {"a": {"seeds": {"0": {"x": 1}}, "trials": {"0": "trial"}}}}}'
+    )
+    assert study.known_trials(tmp_path) == {"trial": {"x": 1}}
+
+
 def test_the_files_can_be_drawn_from_the_numbers_alone(swept, tmp_path):
     folder, _ = swept
     shutil.copy(folder / "out" / "seeds.json", tmp_path)
@@ -182,6 +204,7 @@ def test_where_every_trial_fails_nothing_is_written(refused, base_run, tmp_path,
         ({"kind": "seeds", "targets": ","}, "--targets: no clip named; name at least one to forget, such as "),
         ({"kind": "seeds", "targets": "sway,turn,nod"}, "targets: all 3 clips of the library; leave at least one"),
         ({"kind": "seeds", "base": Path("nowhere")}, "nowhere: no such checkpoint folder"),
+        ({"kind": "seeds", "robot": "h2"}, "robot: the checkpoint's is 'g1', asked for 'h2'"),
         ({"kind": "seeds", "draw": True}, "seeds.json: not measured yet; leave --draw out"),
     ],
 )
