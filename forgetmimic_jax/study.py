@@ -317,8 +317,7 @@ def page(study: Study, document: Mapping[str, Any]) -> str:
     lines = [
         f"# {study.title}",
         "",
-        f"- Robot {asked['robot']}; base trained for {asked['base_environment_steps']:,} environment steps"
-        f"{targets}.",
+        f"- Robot {asked['robot']}; base trained for {asked['base_environment_steps']:,} environment steps{targets}.",
         f"- {asked['iterations']:,} iterations a trial with the {asked['budget']} budget, {asked['seeds']} seed(s), "
         f"{asked['episodes']} episodes a clip.",
         "- In square brackets: the 95 % interval over seeds (Student's t); the seed is the unit. One seed has none.",

@@ -97,9 +97,7 @@ class Page:
         scene.set_background_image(np.full((1, 1, 3), 244, np.uint8))
         size = relative_height(self._model)
         middle, apart, height = (len(self._policies) - 1) / 2.0, LANE[1] + LANE_GAP, LABEL_HEIGHT * size
-        self._lanes = [
-            _Lane(scene, name, robot, (i - middle) * apart, height) for i, name in enumerate(self._policies)
-        ]
+        self._lanes = [_Lane(scene, name, robot, (i - middle) * apart, height) for i, name in enumerate(self._policies)]
         camera = self._server.initial_camera
         camera.position, camera.look_at = size * np.array([3.4, -0.9, 1.5]), size * np.array([0.0, 0.0, 0.62])
 
