@@ -67,7 +67,7 @@ def main(options: Options) -> None:
         seed=options.seed,
         budget={name: cost(info) for name, info in compared.info.items()},
     )
-    base = f" BASE={options.checkpoint}" if options.checkpoint and not compared.targets else ""
+    base = f" BASE={options.checkpoint}" if options.checkpoint and list(compared.info) == ["base"] else ""
     closing(show_and_write(output, document), f"make unlearn ROBOT={options.robot}{base}")
 
 
