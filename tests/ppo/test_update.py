@@ -53,7 +53,7 @@ def run(robot, library, tiny_config) -> Run:
     config = dataclasses.replace(
         unlearning_config(tiny_config, unlearn), wrench=dataclasses.replace(tiny_config.wrench, max_gain=0.6)
     )
-    engine = Faulty(NativeEngine(robot, config.physics.substeps, ENVS))
+    engine = Faulty(NativeEngine(robot, 1, ENVS))  # with the wrench, a physics step at a time
     env = Environment(config, robot, engine, ENVS, noisy=True)
     assets = make_assets(config, robot, library)
     begin = jax.jit(lambda assets, key: init_state(env, assets, key))
