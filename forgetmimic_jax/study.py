@@ -209,13 +209,11 @@ class Lab:
         names = {key: self.trial(variant).folder.name for key, variant in options.items()}
         missing = {key: variant for key, variant in options.items() if names[key] not in self.known}
         folders = self.run(missing, what, others=len(missing) < len(options)) if missing else {}
+        found = {key: self.known[name] for key, name in names.items() if name in self.known}
+        found |= {key: summary(folder) for key, folder in folders.items()}
         result = {}
         for label, variant in variants.items():
-            runs = {
-                seed: self.known.get(names[label, seed]) or summary(folders[label, seed])
-                for seed in every[label]
-                if names[label, seed] in self.known or (label, seed) in folders
-            }
+            runs = {seed: found[label, seed] for seed in every[label] if (label, seed) in found}
             if runs:
                 result[label] = {
                     "options": {name: str(value) for name, value in variant.items()},
