@@ -63,7 +63,7 @@ def main(options: Options) -> None:
     first_iteration = make_iteration(env)
     state, _ = jax.block_until_ready(first_iteration(assets, state))
     to_first_step = time.perf_counter() - started
-    probabilities = bin_probabilities(config.sampling, assets.bins, state.failure_level)
+    probabilities = bin_probabilities(config.sampling, assets.bins, state.failure_level, assets.is_target)
     gains = jnp.zeros_like(probabilities)
 
     @jax.jit

@@ -110,6 +110,7 @@ class SamplingConfig:
     initial_failure: float = 1.0
     failure_signal: Literal["survival_weighted", "alive_mean"] = "survival_weighted"
     clips: Literal["all", "kept"] = "all"  # kept: no episode of a clip to forget
+    target_share: float = 0.0  # share of the starts that are the targets'; 0: what the rule gives them
 
 
 @dataclass(frozen=True)
@@ -233,7 +234,7 @@ _ABOVE_ZERO = {
 }
 _SHARES = {
     *("reward.torque_soft_ratio", "sampling.smoothing", "sampling.uniform_ratio", "sampling.initial_failure"),
-    *("wrench.max_gain", "ppo.discount", "ppo.gae_lambda"),
+    *("sampling.target_share", "wrench.max_gain", "ppo.discount", "ppo.gae_lambda"),
 }
 
 
@@ -270,6 +271,12 @@ def validate(config: Config) -> None:
         value, default = getattr(config.noise, field_.name), field_.default
         if isinstance(default, tuple) and len(value) != len(default):
             raise InputError(f"noise.{field_.name}: found {len(value)} numbers; accepted: {len(default)}")
+    if config.sampling.target_share and (config.sampling.clips == "kept" or not config.unlearn.targets):
+        found = "sampling.clips = kept" if config.unlearn.targets else "no targets"
+        raise InputError(
+            f"sampling.target_share: found {config.sampling.target_share:g} with {found}; accepted: 0, or a share "
+            "where episodes start from targets too"
+        )
     ppo = config.ppo
     if ppo.num_envs * ppo.num_steps < ppo.minibatches:
         raise InputError(

@@ -96,7 +96,7 @@ def init_state(
         failure_level = initial_failure_level(config, assets)
     zeros = jnp.zeros((env.num_envs,), jnp.int32)
     episodes = start_episodes(env, assets, episode_key, zeros, zeros, zeros, zeros.astype(jnp.float32))
-    probabilities = bin_probabilities(config.sampling, assets.bins, failure_level)
+    probabilities = bin_probabilities(config.sampling, assets.bins, failure_level, assets.is_target)
     gains = wrench_gain(config.wrench, failure_level)
     episodes = reset_where(env, assets, episodes, jnp.ones((env.num_envs,), bool), start_key, probabilities, gains)
     if policy is None:

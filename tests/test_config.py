@@ -163,6 +163,18 @@ def test_the_file_is_plain_yaml(path):
         (changed(actor_layers=(8, 0)), "ppo.actor_layers: found 0; accepted: 1 or more"),
         (changed(num_envs=1, num_steps=2, minibatches=3), "ppo.minibatches: found 3; accepted: 1 to"),
         (changed(num_envs=6, branches=4), "ppo.branches: found 4; accepted: a divisor of num_envs = 6"),
+        (
+            dataclasses.replace(Config(), sampling=dataclasses.replace(Config().sampling, target_share=0.5)),
+            "sampling.target_share: found 0.5 with no targets; accepted: 0, or a share where",
+        ),
+        (
+            dataclasses.replace(
+                Config(),
+                sampling=dataclasses.replace(Config().sampling, target_share=0.5, clips="kept"),
+                unlearn=UnlearnConfig(targets=("kick",)),
+            ),
+            "sampling.target_share: found 0.5 with sampling.clips = kept; accepted: 0, or a share where",
+        ),
         (dataclasses.replace(Config(), seed=-1), "seed: found -1; accepted: 0 to 4294967295"),
         (dataclasses.replace(Config(), evaluate_every=-1), "evaluate_every: found -1; accepted: 0 or more"),
         (

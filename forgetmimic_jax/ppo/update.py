@@ -89,7 +89,7 @@ def collect(env: Environment, assets: Assets, state: TrainState) -> tuple[TrainS
     """
     config, policy, method = env.config, state.policy, method_of(env.config)
     actor, critic = make_actor(config, env.robot.num_joints), make_critic(config)
-    probabilities = bin_probabilities(config.sampling, assets.bins, state.failure_level)
+    probabilities = bin_probabilities(config.sampling, assets.bins, state.failure_level, assets.is_target)
     gains = wrench_gain(config.wrench, state.failure_level)
 
     def value_of(observation: Array) -> Array:
@@ -146,7 +146,7 @@ def draw_states(env: Environment, assets: Assets, state: TrainState) -> tuple[Tr
     """Starts of episodes in the place of a rollout: nothing moves, nothing is rewarded and no episode ends."""
     config, policy = env.config, state.policy
     actor = make_actor(config, env.robot.num_joints)
-    probabilities = bin_probabilities(config.sampling, assets.bins, state.failure_level)
+    probabilities = bin_probabilities(config.sampling, assets.bins, state.failure_level, assets.is_target)
     nothing, never = jnp.zeros((env.num_envs,), jnp.float32), jnp.zeros((env.num_envs,), bool)
 
     def one_batch(key: Array) -> Trajectory:
@@ -275,7 +275,7 @@ def learn_sampler(
         config.sampling, state.failure_level, done, trajectory.failure, trajectory.clip, trajectory.start_bin
     )
     diverged = trajectory.diverged.sum().astype(jnp.int32)
-    probabilities = bin_probabilities(config.sampling, assets.bins, failure_level)
+    probabilities = bin_probabilities(config.sampling, assets.bins, failure_level, assets.is_target)
     metrics = losses | _metrics(env, assets, trajectory, done, probabilities) | {"diverged": diverged}
     metrics["top_bin_probability"] = probabilities.max()
     state = dataclasses.replace(

@@ -49,13 +49,25 @@ def make_bins(library: MotionLibrary, bin_seconds: float, control_step: float) -
     )
 
 
-def bin_probabilities(config: SamplingConfig, bins: Bins, failure_level: Array) -> Array:
+def bin_probabilities(
+    config: SamplingConfig, bins: Bins, failure_level: Array, is_target: Array | None = None
+) -> Array:
     """p [clip, bin] of starting in each bin.
 
     adaptive and frozen: p = (1 − ρ) softmax(L/τ + ln p0) + ρ p0 with τ = 1/ln(1 + N_valid); frozen differs only in that
     L is no longer updated. The prior p0 is the paper's 1/N_valid, or with `prior` clips the same for every clip.
     uniform_bins: 1/N_valid. uniform_clips: a clip uniformly, then a frame uniformly.
+
+    With `target_share` the clips of is_target (bool[clip]) get that share of it all, and the others the rest.
     """
+    probabilities = _by_rule(config, bins, failure_level)
+    if not config.target_share or is_target is None:
+        return probabilities
+    targets, kept = probabilities * is_target[:, None], probabilities * ~is_target[:, None]
+    return config.target_share * targets / targets.sum() + (1.0 - config.target_share) * kept / kept.sum()
+
+
+def _by_rule(config: SamplingConfig, bins: Bins, failure_level: Array) -> Array:
     count = bins.valid.sum()
     if config.rule == "uniform_clips":
         frames = jnp.where(bins.valid, bins.end - bins.start, 0)

@@ -79,6 +79,19 @@ def test_a_prior_over_clips_does_not_favour_the_clip_of_many_bins():
     np.testing.assert_allclose(bin_probabilities(config, bins_of([11, 21], 10), level), expected, rtol=1e-5)
 
 
+@pytest.mark.parametrize("rule", RULES)
+def test_the_targets_get_their_share_and_each_side_keeps_the_rules_proportions(rule):
+    bins = bins_of([11, 21, 16], 10)
+    level = jnp.array([[0.5, 0.9], [0.0, 1.0], [0.3, 0.6]])
+    is_target = jnp.array([True, False, True])
+    plain = np.asarray(bin_probabilities(SamplingConfig(rule=rule), bins, level, is_target))
+    shared = np.asarray(bin_probabilities(SamplingConfig(rule=rule, target_share=0.7), bins, level, is_target))
+    assert shared[[0, 2]].sum() == pytest.approx(0.7)
+    assert shared[1].sum() == pytest.approx(0.3)
+    np.testing.assert_allclose(shared[[0, 2]], 0.7 * plain[[0, 2]] / plain[[0, 2]].sum(), rtol=1e-5)
+    np.testing.assert_allclose(shared[1], 0.3 * plain[1] / plain[1].sum(), rtol=1e-5)
+
+
 def test_uniform_bins_gives_every_bin_the_same():
     bins = bins_of([11, 21], 10)
     expected = np.array([[1, 0], [1, 1]]) / 3.0
