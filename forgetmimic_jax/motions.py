@@ -230,9 +230,12 @@ def show(robot: Robot, options: Show) -> None:
             print(f"{field:<20} {value}")
     print()
     _print_table([measure(robot, clips[0], cycle)], entries)
+    shipped_with_policy = (folder / "base").is_dir()
     closing(
         {"drawing": output, "clip": folder / f"{options.clip}.npz"},
-        f"make unlearn ROBOT={robot.name} LIBRARY={folder} TARGETS={options.clip}",
+        f"make unlearn ROBOT={robot.name} TARGETS={options.clip}"
+        if shipped_with_policy
+        else f"make pretrain ROBOT={robot.name} LIBRARY={folder}",
     )
 
 

@@ -100,7 +100,9 @@ def test_show_and_list(run, robot, tmp_path):
     code, out, _ = run("show", "sway", "--library", "mine")
     assert code == 0
     assert "CC0" in out
+    assert "Next: make pretrain ROBOT=g1 LIBRARY=mine" in out
     assert (tmp_path / "runs" / "sway.png").is_file()
+    assert "Next: make unlearn ROBOT=g1 TARGETS=kick" in run("show", "kick")[1]
     code, out, _ = run("list", "--library", "mine")
     assert code == 0
     assert "sway     1.20 s  invented" in out
