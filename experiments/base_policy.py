@@ -71,7 +71,7 @@ survival-weighted tracking (success) at the environment steps since the start.
   is not where the true one does ([the gradient's bias](gradient_noise.md)). *Short*, which trusts the critic sooner
   still, is the worse policy. *Long* and *longer* pay for a truer direction with noise, and improve again.
 
-## Clips that are not learned
+## Clips that were not learned
 
 dance_a, spin and backflip have hardly moved in tens of millions of steps. One reason was the library. *Missing* is
 the acceleration that no contact with the floor gives (the largest mean over 0.2 s, force and moment together),
