@@ -73,7 +73,7 @@ survival-weighted tracking (success) at the environment steps since the start.
 
 ## Clips that were not learned
 
-dance_a, spin and backflip have hardly moved in tens of millions of steps. One reason was the library. *Missing* is
+dance_a, spin and backflip had hardly moved in tens of millions of steps. One reason was the library. *Missing* is
 the acceleration that no contact with the floor gives (the largest mean over 0.2 s, force and moment together),
 *torque* the load of the worst motor but the wrists' over its limit (the largest mean over 0.1 s): two columns of
 `make motions ARGS=check`. Success and tracking: 100 episodes a clip, the base shipped with the earlier library, the
@@ -99,7 +99,7 @@ one *before* the last bullet below, and the one shipped now.
 - What they lacked was **their share of the steps**. Adaptive sampling gives a clip that fails half the time hardly
   twice the starts of one that does not, and its episodes are short, so the kick had some 6 % of the steps. *Before* is
   the base of stage 16; *now* three quarters of the starts are those of kick, spin and dance_a
-  (`sampling.target_share`), the others held by the anchor: stage 17.
+  (`sampling.target_share`), the others held by the anchor: stages 17 and 18.
 
 So look at both columns before training on clips of your own.
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from forgetmimic_jax.study import measured_page
+from forgetmimic_jax.study import measured_page, named_policy
 
 HERE = Path(__file__).parent
 RESULT = HERE / "results" / "feasibility.json"
@@ -57,7 +57,7 @@ def measure(checkpoint_path: Path) -> dict:
     import jax.numpy as jnp
 
     from forgetmimic_jax import checkpoint, runner
-    from forgetmimic_jax.evaluation.rollout import act, begin_episodes
+    from forgetmimic_jax.evaluation.rollout import Evaluator, act, begin_episodes
     from forgetmimic_jax.tracking import env as tracking
 
     info = checkpoint.read_info(checkpoint_path)
@@ -65,21 +65,6 @@ def measure(checkpoint_path: Path) -> dict:
     setup = runner.make_setup(config)
     policy = checkpoint.load_policy(checkpoint_path, runner.template(setup))
     names, lengths, assets = setup.library.names, np.asarray(setup.library.length), setup.assets
-
-    def advance(env, state, added):
-        action = act(env, policy, tracking.observe(env, assets, state, None)[0]) + added
-        state, result = tracking.step(env, assets, state, action, jax.random.PRNGKey(0))
-        return state, result.terminated, result.reward.normalized_tracking
-
-    def first_falls() -> np.ndarray:
-        env = tracking.make_environment(config, setup.robot, len(names), noisy=False)
-        clip = jnp.arange(len(names))
-        state = begin_episodes(env, assets, jax.random.PRNGKey(0), clip, jnp.zeros_like(clip))
-        state, terminated = jax.jit(
-            lambda state: jax.lax.scan(lambda s, _: advance(env, s, 0.0)[:2], state, length=int(lengths.max()) - 1)
-        )(state)
-        fallen = np.asarray(terminated).T & (np.arange(int(lengths.max()) - 1) < lengths[:, None] - 1)
-        return np.where(fallen.any(-1), fallen.argmax(-1), -1)
 
     env = tracking.make_environment(config, setup.robot, ROLLOUTS, noisy=False)
 
@@ -93,20 +78,22 @@ def measure(checkpoint_path: Path) -> dict:
 
         def one_step(carry, added):
             state, alive, lived, tracked = carry
-            state, terminated, reward = advance(env, state, added)
-            alive = alive & ~terminated
-            return (state, alive, lived + alive, tracked + jnp.where(alive, reward, 0.0)), None
+            action = act(env, policy, tracking.observe(env, assets, state, None)[0]) + added
+            state, result = tracking.step(env, assets, state, action, jax.random.PRNGKey(0))
+            alive = alive & ~result.terminated
+            tracked = tracked + jnp.where(alive, result.reward.normalized_tracking, 0.0)
+            return (state, alive, lived + alive, tracked), None
 
         zeros = jnp.zeros(ROLLOUTS)
         (_, _, lived, tracked), _ = jax.lax.scan(one_step, (state, zeros == 0, zeros, zeros), added)
         return lived, tracked / steps
 
     rolled = jax.jit(roll, static_argnums=2)
+    alone = Evaluator(config, setup.robot, setup.library, episodes=1, seed=0).rollout(policy)  # each from frame 0
     found = {}
-    for clip, fall in enumerate(first_falls()):
-        if fall < 0:
-            continue
-        start = max(0, int(fall) - BEFORE)
+    for clip in np.flatnonzero(alone.length < alone.horizon):
+        fall = int(alone.length[clip])
+        start = max(0, fall - BEFORE)
         steps = min(WINDOW, int(lengths[clip]) - 1 - start)
         state = begin_episodes(
             env, assets, jax.random.PRNGKey(0), jnp.full(ROLLOUTS, clip), jnp.full(ROLLOUTS, start, jnp.int32)
@@ -123,7 +110,7 @@ def measure(checkpoint_path: Path) -> dict:
             best = knots[np.argsort(-(lived / steps + tracked))[:ELITES]]
             mean = KEEP * mean + (1 - KEEP) * best.mean(0)
             std = np.maximum(KEEP * std + (1 - KEEP) * best.std(0), LEAST_STD)
-        found[names[clip]] = {"fall": int(fall), "start": start, "steps": steps, "rounds": history}
+        found[names[clip]] = {"fall": fall, "start": start, "steps": steps, "rounds": history}
         print(f"{names[clip]}: the policy lives {history[0][0]:.0f} of {steps} steps, the search {history[-1][0]:.0f}")
     return {
         "policy": "/".join(checkpoint_path.parts[-3:]),
@@ -152,6 +139,4 @@ def page(found: dict) -> str:
 
 
 if __name__ == "__main__":
-    from experiments.gradient_noise import named_policy
-
     measured_page(lambda: measure(named_policy()), page, RESULT, PAGE)

@@ -12,12 +12,11 @@ from __future__ import annotations
 
 import dataclasses
 import operator
-import sys
 from pathlib import Path
 
 import numpy as np
 
-from forgetmimic_jax.study import measured_page
+from forgetmimic_jax.study import measured_page, named_policy
 
 HERE = Path(__file__).parent
 RESULT = HERE / "results" / "gradient_noise.json"
@@ -168,13 +167,6 @@ def page(found: dict) -> str:
         noise="\n".join(noise),
         bias="\n".join(bias),
     )
-
-
-def named_policy() -> Path:
-    """The checkpoint on the command line, or the shipped base."""
-    from forgetmimic_jax import runner
-
-    return Path(sys.argv[1]) if sys.argv[1:] else runner.base_folder("g1")
 
 
 if __name__ == "__main__":

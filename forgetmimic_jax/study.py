@@ -370,6 +370,13 @@ def measured_page(measure: Callable[[], Any], page: Callable[[Any], str], result
     print(f"numbers  {result}\npage     {path}")
 
 
+def named_policy() -> Path:
+    """The checkpoint on a measurement's command line, or the shipped base of the G1."""
+    from forgetmimic_jax import runner
+
+    return Path(sys.argv[1]) if sys.argv[1:] else runner.base_folder("g1")
+
+
 def main(study: Study, options: type[Options] = Options, arguments: Iterable[str] | None = None) -> None:
     """The command of a study's file."""
     program = f"python -m experiments.{study.name}"
