@@ -3,7 +3,8 @@
 Every clip from its first frame, without reset noise: where the policy falls first. There a search that knows the future
 takes over: the cross-entropy method on what is added to the policy's actions over the steps around the fall, as knots
 joined by straight lines. What it finds is possible for this robot and these bounds; where it finds nothing, a search
-of this size did not, which is a hint and no proof. `--draw` rewrites the page from the stored numbers alone.
+of this size did not, which is a hint and no proof. It goes on under reset noise, for what `distill.py` is to teach must
+not hang on one state. `--draw` rewrites the page from the stored numbers alone.
 """
 
 from __future__ import annotations
@@ -18,26 +19,29 @@ from forgetmimic_jax.study import measured_page, named_policy
 HERE = Path(__file__).parent
 RESULT = HERE / "results" / "feasibility.json"
 PAGE = HERE / "feasibility.md"
-BEFORE, WINDOW, KNOT = 25, 45, 4  # control steps: before the fall, searched, between two knots
-ROLLOUTS, ELITES, ROUNDS = 384, 48, 60
+BEFORE, WINDOW, AFTER, KNOT = 25, 45, 30, 4  # control steps: before the fall, searched, to live after, between knots
+ROLLOUTS, ROUNDS, ELITES = 384, 45, 48
+NOISY_ROUNDS, NOISY_ELITES = 30, 96  # luck counts for less among more of them
 STARTING_STD, LEAST_STD, KEEP = 1.5, 0.15, 0.3  # of what is added, in units of action; share of the old estimate
 
 TEXT = """# Could the robot do what the policy fails to do?
 
 Every clip of the G1 from its first frame, without reset noise, by the mean actions of `{policy}`
 ({environment_steps:,} environment steps). Where it falls, a search that knows the future takes over {before} steps
-earlier: the cross-entropy method ({rounds} rounds of {rollouts} rollouts of {window} control steps) on what is added to
-the policy's actions, for tracking reward and for not falling; seed 0.
-`python experiments/feasibility.py CHECKPOINT` measures it again (some three minutes a clip on two cores), `--draw`
+earlier: the cross-entropy method ({rounds} rounds of {rollouts} rollouts) on what is added to the policy's actions
+over {window} control steps, for tracking reward and for not falling, then and in the {after} steps after them. It
+goes on for {noisy_rounds} rounds whose every rollout has other reset noise. Seed 0.
+`python experiments/feasibility.py CHECKPOINT` measures it again (some five minutes a clip on two cores), `--draw`
 rewrites this page from `results/feasibility.json`.
 
-| clip | the policy falls at frame | searched from | the policy lives | the search lives | tracking of both |
-|---|---|---|---|---|---|
+| clip | policy falls at frame | searched from | policy lives | search lives | tracking of both | under noise |
+|---|---|---|---|---|---|---|
 {rows}
 
-*Lives*: control steps of those searched; *tracking*: mean tracking reward over them, 0 after a fall. Clips that are not
-in the table are lived through. What a search finds, the robot can do; where it finds nothing, the motion may be beyond
-the motors or the bounds, or the search too small.
+*Lives*: control steps of those searched and after, the longest of the search's last exact round; *tracking*: mean
+tracking reward over them, 0 after a fall; *under noise*: share of {rollouts} rollouts with reset noise that what was
+found lives through without looking. Clips that are not in the table are lived through. What a search finds, the robot
+can do; where it finds nothing, the motion may be beyond the motors or the bounds, or the search too small.
 """
 
 
@@ -57,61 +61,90 @@ def measure(checkpoint_path: Path) -> dict:
     import jax.numpy as jnp
 
     from forgetmimic_jax import checkpoint, runner
-    from forgetmimic_jax.evaluation.rollout import Evaluator, act, begin_episodes
+    from forgetmimic_jax.evaluation.rollout import Evaluator, act, begin_episodes, evaluation_config
     from forgetmimic_jax.tracking import env as tracking
 
     info = checkpoint.read_info(checkpoint_path)
-    config = without_reset_noise(dataclasses.replace(info.config, base=str(checkpoint_path)))
+    config = dataclasses.replace(info.config, base=None)
     setup = runner.make_setup(config)
     policy = checkpoint.load_policy(checkpoint_path, runner.template(setup))
     names, lengths, assets = setup.library.names, np.asarray(setup.library.length), setup.assets
 
-    env = tracking.make_environment(config, setup.robot, ROLLOUTS, noisy=False)
+    def roller(config):
+        """roll(clip, start, knots [rollout, knot, joint], steps searched, steps in all, key)."""
+        env = tracking.make_environment(config, setup.robot, ROLLOUTS, noisy=False)
 
-    def roll(state, knots, steps: int):
-        """Steps lived and mean tracking, each [rollout], of knots [rollout, knot, joint]."""
-        places = jnp.linspace(0, knots.shape[1] - 1, steps)
-        low = jnp.minimum(places.astype(int), knots.shape[1] - 2)
-        share = (places - low)[:, None, None]
-        added = jnp.moveaxis(knots, 1, 0)
-        added = (1 - share) * added[low] + share * added[low + 1]
+        def roll(clip, start, knots, window: int, steps: int, key):
+            """Steps lived and mean tracking, each [rollout]."""
+            state = begin_episodes(env, assets, key, jnp.full(ROLLOUTS, clip), jnp.full(ROLLOUTS, start, jnp.int32))
+            state = tracking.refresh_bodies(env, state, jnp.ones(ROLLOUTS, bool))
+            places = jnp.linspace(0, knots.shape[1] - 1, window)
+            low = jnp.minimum(places.astype(int), knots.shape[1] - 2)
+            share = (places - low)[:, None, None]
+            knots = jnp.moveaxis(knots, 1, 0)
+            added = (1 - share) * knots[low] + share * knots[low + 1]
+            added = jnp.concatenate([added, jnp.zeros((steps - window, *added.shape[1:]))])
 
-        def one_step(carry, added):
-            state, alive, lived, tracked = carry
-            action = act(env, policy, tracking.observe(env, assets, state, None)[0]) + added
-            state, result = tracking.step(env, assets, state, action, jax.random.PRNGKey(0))
-            alive = alive & ~result.terminated
-            tracked = tracked + jnp.where(alive, result.reward.normalized_tracking, 0.0)
-            return (state, alive, lived + alive, tracked), None
+            def one_step(carry, added):
+                state, alive, lived, tracked = carry
+                action = act(env, policy, tracking.observe(env, assets, state, None)[0]) + added
+                state, result = tracking.step(env, assets, state, action, jax.random.PRNGKey(0))
+                alive = alive & ~result.terminated
+                tracked = tracked + jnp.where(alive, result.reward.normalized_tracking, 0.0)
+                return (state, alive, lived + alive, tracked), None
 
-        zeros = jnp.zeros(ROLLOUTS)
-        (_, _, lived, tracked), _ = jax.lax.scan(one_step, (state, zeros == 0, zeros, zeros), added)
-        return lived, tracked / steps
+            zeros = jnp.zeros(ROLLOUTS)
+            (_, _, lived, tracked), _ = jax.lax.scan(one_step, (state, zeros == 0, zeros, zeros), added)
+            return lived, tracked / steps
 
-    rolled = jax.jit(roll, static_argnums=2)
-    alone = Evaluator(config, setup.robot, setup.library, episodes=1, seed=0).rollout(policy)  # each from frame 0
+        return jax.jit(roll, static_argnums=(3, 4))
+
+    quiet = without_reset_noise(config)
+    exact, noisy = roller(quiet), roller(evaluation_config(config))
+    alone = Evaluator(quiet, setup.robot, setup.library, episodes=1, seed=0).rollout(policy)  # each from frame 0
     found = {}
     for clip in np.flatnonzero(alone.length < alone.horizon):
-        fall = int(alone.length[clip])
+        fall, last = int(alone.length[clip]), int(lengths[clip]) - 1
         start = max(0, fall - BEFORE)
-        steps = min(WINDOW, int(lengths[clip]) - 1 - start)
-        state = begin_episodes(
-            env, assets, jax.random.PRNGKey(0), jnp.full(ROLLOUTS, clip), jnp.full(ROLLOUTS, start, jnp.int32)
-        )
+        window = min(WINDOW, last - start)
+        steps = min(WINDOW + AFTER, last - start)
+
+        def lives(roll, knots, seed, clip=clip, start=start, window=window, steps=steps):
+            rolled = roll(clip, start, jnp.asarray(knots, jnp.float32), window, steps, jax.random.PRNGKey(seed))
+            return tuple(np.asarray(x) for x in rolled)
+
         rng = np.random.default_rng(0)
-        mean = np.zeros((max(2, steps // KNOT), setup.robot.num_joints))
+        mean = np.zeros((max(2, window // KNOT), setup.robot.num_joints))
         std = np.full_like(mean, STARTING_STD)
         history = []
-        for _ in range(ROUNDS):
+        for number in range(ROUNDS + NOISY_ROUNDS):
             knots = mean + std * rng.standard_normal((ROLLOUTS, *mean.shape))
-            knots[0] = mean
-            lived, tracked = (np.asarray(x) for x in rolled(state, jnp.asarray(knots, jnp.float32), steps))
-            history.append((float(lived[0]), float(tracked[0])))
-            best = knots[np.argsort(-(lived / steps + tracked))[:ELITES]]
+            if number < ROUNDS:
+                knots[0] = mean
+            lived, tracked = lives(exact if number < ROUNDS else noisy, knots, number)
+            if number == 0:
+                policy_alone = float(lived[0]), float(tracked[0])
+            if number < ROUNDS:
+                longest = np.argmax(lived / steps + tracked)
+                history.append((float(lived[longest]), float(tracked[longest])))
+            order = np.argsort(-(lived / steps + tracked))
+            best = knots[order[: ELITES if number < ROUNDS else NOISY_ELITES]]
             mean = KEEP * mean + (1 - KEEP) * best.mean(0)
             std = np.maximum(KEEP * std + (1 - KEEP) * best.std(0), LEAST_STD)
-        found[names[clip]] = {"fall": fall, "start": start, "steps": steps, "rounds": history}
-        print(f"{names[clip]}: the policy lives {history[0][0]:.0f} of {steps} steps, the search {history[-1][0]:.0f}")
+        lived, _ = lives(noisy, np.repeat(mean[None], ROLLOUTS, 0), ROUNDS + NOISY_ROUNDS)
+        found[names[clip]] = {
+            "fall": fall,
+            "start": start,
+            "window": window,
+            "steps": steps,
+            "policy": policy_alone,
+            "rounds": history,
+            "lived_under_noise": float(np.mean(lived >= steps)),
+            "knots": np.round(mean, 3).tolist(),
+        }
+        print(
+            f"{names[clip]}: the policy lives {policy_alone[0]:.0f} of {steps} steps, the search {history[-1][0]:.0f}"
+        )
     return {
         "policy": "/".join(checkpoint_path.parts[-3:]),
         "environment_steps": info.environment_steps,
@@ -123,17 +156,19 @@ def page(found: dict) -> str:
     """The page of the stored numbers."""
     rows = []
     for name, clip in found["clips"].items():
-        (policy_lives, policy_tracks), (lives, tracks) = clip["rounds"][0], clip["rounds"][-1]
+        (policy_lives, policy_tracks), (lives, tracks) = clip["policy"], clip["rounds"][-1]
         rows.append(
-            f"| {name} | {clip['fall']} | {clip['start']} | {policy_lives:.0f} of {clip['steps']} | "
-            f"{lives:.0f} of {clip['steps']} | {policy_tracks:.2f}, {tracks:.2f} |"
+            f"| {name} | {clip['fall']} | {clip['start']} | {policy_lives:.0f} of {clip['steps']} | {lives:.0f} of "
+            f"{clip['steps']} | {policy_tracks:.2f}, {tracks:.2f} | {100 * clip['lived_under_noise']:.0f} % |"
         )
     return TEXT.format(
         **{name: found[name] for name in ("policy", "environment_steps")},
         before=BEFORE,
         rounds=ROUNDS,
+        noisy_rounds=NOISY_ROUNDS,
         rollouts=ROLLOUTS,
         window=WINDOW,
+        after=AFTER,
         rows="\n".join(rows),
     )
 
