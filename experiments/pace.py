@@ -56,7 +56,7 @@ TEXT = """# Unlearning's pace on a laptop
 
 ## Length
 
-On the shipped base, of 54.3 M steps.
+On the base of 54.3 M steps, the shipped one of an earlier day.
 
 {shipped}
 - At 240 iterations more of the targets is left than at 320, whatever is done to hurry; larger steps and more epochs are
@@ -79,7 +79,7 @@ On the base of 52.3 M steps, the shipped one without its last stage.
   where it was, and the step size can be large again. A weaker one holds less; with a small step size it is the targets
   that stay.
 - Without equal clips the anchor keeps as well, and forgets less.
-- Half of the length nearly does here; on the shipped base, whose kick is better, it does not.
+- Half of the length nearly does here; on the base above, whose kick is better, it does not.
 
 ## Lengths and step sizes, without anchor and equal clips
 

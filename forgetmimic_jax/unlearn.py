@@ -102,7 +102,9 @@ def main(options: Options) -> None:
     setup = runner.with_base(runner.make_setup(on_engine(config, options.physics)))
     info = checkpoint.read_info(runner.base_checkpoint(config))
     description = f"forget {', '.join(config.unlearn.targets)}"
-    if config.unlearn.method != UnlearnConfig.method:
+    if config.unlearn.method == "finetune" and config.sampling.clips == "all":
+        description = "fine-tune on all clips"  # which is no forgetting
+    elif config.unlearn.method != UnlearnConfig.method:
         description += f" by {config.unlearn.method}"
     path, state = runner.run(setup, output, description=description, resume=options.resume)
     result = method_of(config).result
