@@ -104,7 +104,7 @@ one *before* the targets' share below, and the one shipped now.
   actions far from the policy's, five units where exploration noise goes 0.3. The policy learned what the search adds
   by regression (`distill.py`), which alone let one episode in twenty through, and four million steps of PPO made two in
   five of that: stages 20 and 21. Both lines of training were then distilled into one policy, which kept what either
-  could: stage 22.
+  could: stage 22. Four million steps more, and the backflip succeeds four times in five.
 
 So look at both columns before training on clips of your own.
 
