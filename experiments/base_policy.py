@@ -99,7 +99,7 @@ one *before* the targets' share below, and the one shipped now.
 - What they lacked was **their share of the steps**. Adaptive sampling gives a clip that fails half the time hardly
   twice the starts of one that does not, and its episodes are short, so the kick had some 6 % of the steps. *Before* is
   the base of stage 16; *now* three quarters of the starts are those of kick, spin and dance_a
-  (`sampling.target_share`), the others held by the anchor: stages 17 to 19, and 23.
+  (`sampling.target_share`), the others held by the anchor: stages 17 to 19, 23 and 24.
 - The backflip lacked **a first success**. [A search](feasibility.md) finds take-off, flight and landing once it tries
   actions far from the policy's, five units where exploration noise goes 0.3. The policy learned what the search adds
   by regression (`distill.py`), which alone let one episode in twenty through, and four million steps of PPO made two in
