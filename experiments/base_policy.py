@@ -101,10 +101,10 @@ one *before* the targets' share below, and the one shipped now.
   the base of stage 16; *now* three quarters of the starts are those of kick, spin and dance_a
   (`sampling.target_share`), the others held by the anchor: stages 17 to 19, 23 and 24.
 - The backflip lacked **a first success**. [A search](feasibility.md) finds take-off, flight and landing once it tries
-  actions far from the policy's, five units where exploration noise goes 0.3. The policy learned what the search adds
-  by regression (`distill.py`), which alone let one episode in twenty through, and four million steps of PPO made two in
-  five of that: stages 20 and 21. Both lines of training were then distilled into one policy, which kept what either
-  could: stage 22. Four million steps more, and the backflip succeeds four times in five.
+  actions far from the policy's, more than four units where exploration noise goes 0.3. The policy learned what the
+  search adds by regression (`distill.py`), which alone let one episode in twenty through, and four million steps of
+  PPO made two in five of that: stages 20 and 21. Both lines of training were then distilled into one policy, which kept
+  what either could: stage 22. Four million steps more, and the backflip succeeds four times in five.
 
 So look at both columns before training on clips of your own.
 

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import tyro
 
+from experiments.feasibility import RESULT, straight_lines
 from forgetmimic_jax.errors import InputError, nearest, run_command
 
 ENVIRONMENTS, STEPS, EPISODE = 512, 24, 80  # a round's, and at most of an episode
@@ -38,7 +39,7 @@ class Options:
     """Specialists."""
     found: Annotated[tuple[str, ...], tyro.conf.arg(metavar="CLIP")] = ()
     """Clips whose teacher acts with what feasibility.py found for them on top."""
-    search: Path = field(default=Path(__file__).parent / "results" / "feasibility.json")
+    search: Path = RESULT
     """What feasibility.py found."""
     rounds: int = 80
     """Of 512 environments × 24 steps."""
@@ -52,10 +53,8 @@ def correction(search: Path, clip: str, cycle: int) -> np.ndarray:
         raise InputError(f"--found: {search} has nothing for '{clip}'; {nearest(clip, clips)}")
     of = clips[clip]
     knots = np.asarray(of["knots"])
-    places = np.linspace(0, len(knots) - 1, of["window"])
-    lines = [np.interp(places, np.arange(len(knots)), knots[:, joint]) for joint in range(knots.shape[1])]
     added = np.zeros((cycle, knots.shape[1]))
-    added[(of["start"] + np.arange(of["window"])) % cycle] = np.stack(lines, axis=-1)
+    added[(of["start"] + np.arange(of["window"])) % cycle] = straight_lines(len(knots), of["window"]) @ knots
     return added
 
 
@@ -86,9 +85,12 @@ def distill(options: Options) -> None:
         raise InputError(f"{options.output}: exists already; choose another, or remove it")
     runner.check_writable(options.output)
     info = checkpoint.read_info(options.student)
-    config = dataclasses.replace(info.config, base=None, unlearn=UnlearnConfig(), max_episode_steps=EPISODE)
+    config = info.config
     config = dataclasses.replace(
         config,
+        base=None,
+        max_episode_steps=EPISODE,
+        unlearn=UnlearnConfig(),
         ppo=dataclasses.replace(config.ppo, num_envs=ENVIRONMENTS, branches=1),
         sampling=dataclasses.replace(config.sampling, clips="all", target_share=0.0),
         wrench=dataclasses.replace(config.wrench, max_gain=0.0),

@@ -55,6 +55,12 @@ def without_reset_noise(config):
     return dataclasses.replace(config, noise=dataclasses.replace(config.noise, **nothing))
 
 
+def straight_lines(knots: int, steps: int) -> np.ndarray:
+    """Weights [step, knot] of the knots, evenly spread over the steps, in what is added at each step."""
+    places = np.linspace(0, knots - 1, steps)
+    return np.stack([np.interp(places, np.arange(knots), one) for one in np.eye(knots)], axis=-1)
+
+
 def measure(checkpoint_path: Path) -> dict:
     """First falls, and a search at each."""
     import jax
@@ -78,11 +84,7 @@ def measure(checkpoint_path: Path) -> dict:
             """Steps lived and mean tracking, each [rollout]."""
             state = begin_episodes(env, assets, key, jnp.full(ROLLOUTS, clip), jnp.full(ROLLOUTS, start, jnp.int32))
             state = tracking.refresh_bodies(env, state, jnp.ones(ROLLOUTS, bool))
-            places = jnp.linspace(0, knots.shape[1] - 1, window)
-            low = jnp.minimum(places.astype(int), knots.shape[1] - 2)
-            share = (places - low)[:, None, None]
-            knots = jnp.moveaxis(knots, 1, 0)
-            added = (1 - share) * knots[low] + share * knots[low + 1]
+            added = jnp.einsum("sk,rkj->srj", straight_lines(knots.shape[1], window).astype(np.float32), knots)
             added = jnp.concatenate([added, jnp.zeros((steps - window, *added.shape[1:]))])
 
             def one_step(carry, added):
