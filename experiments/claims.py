@@ -33,7 +33,7 @@ SUCCESS, TRACKING = "success_rate", "survival_weighted_tracking"
 NONE = 0.05  # of episodes: a success rate below it counts as none
 POINTS = 0.05  # of success that kept clips may lose
 SOONER = 1.0  # steps by which an episode may end before doing nothing would end it
-ARFT = "arft, uniform clips"
+ARFT, UNIFORM = "arft", "arft, uniform clips"
 
 
 @dataclass(frozen=True)
@@ -101,10 +101,10 @@ def of_comparison(document: Mapping[str, Any]) -> Iterator[Finding]:
             yield Finding(f"{method} forgets less", judged(target, 0.0, below=False), evidence)
     for label, name in (("arft, adaptive", "adaptive RSI"), ("arft, uniform clips, wrench", "the wrench")):
         for group, claim in (("target", f"{name} resists forgetting"), ("kept", f"{name} costs the kept clips")):
-            change = gained(variants, label, ARFT, group, TRACKING)
+            change = gained(variants, label, UNIFORM, group, TRACKING)
             if change:
                 verdict = judged(change, 0.0, below=group == "kept")
-                yield Finding(claim, verdict, f"{group} tracking {number(change, 2)} on λ = 16's without it")
+                yield Finding(claim, verdict, f"{group} tracking {number(change, 2)} on that of {UNIFORM}")
 
 
 def of_penalty(document: Mapping[str, Any]) -> Iterator[Finding]:

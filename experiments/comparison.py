@@ -24,6 +24,7 @@ METHODS: dict[str, dict[str, Any]] = {
             *("negated_reward", "gradient_ascent", "policy_edit"),
         )
     },
+    "arft": {},
     "arft, λ = 8": {"penalty": 8.0},
     "arft, plain PPO": PLAIN,
 }

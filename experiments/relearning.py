@@ -37,9 +37,11 @@ def measure(lab: Lab) -> dict[str, Any]:
     folders = lab.run(starts, "policies to relearn from")
     base = _on_targets(json.loads(next(iter(folders.values())).joinpath("evaluation.json").read_text()), lab.targets)
     every = max(1, lab.iterations // EVALUATIONS)
-    # A start's own settings would be its training's: all of them relearn at the same fixed pace, held by nothing.
+    # A start's own settings would be its training's: all of them relearn at the same fixed pace, held by nothing, from
+    # starts that favour no clip.
     pace = {**PACE, "schedule": "fixed", "anchor": 0.0} if lab.options.budget == "cpu" else {}
-    alike = [f"ppo.{name}={json.dumps(value)}" for name, value in pace.items()] + ["wrench.max_gain=0.0"]
+    alike = [f"ppo.{name}={json.dumps(value)}" for name, value in pace.items()]
+    alike += ["wrench.max_gain=0.0", "sampling.target_share=0.0"]
     measured = [f"evaluate_every={every}", f"evaluate_episodes={max(1, lab.options.episodes // 2)}"]
     watched = {"clips": "all", "set": [*measured, *alike]}
     relearn: dict[tuple[str, int], dict[str, Any]] = {

@@ -103,10 +103,11 @@ def seeds_study(_: tuple[str, ...] = ()) -> Study:
 
 
 def ablation(samplers: tuple[str, ...] = SAMPLERS) -> dict[str, dict[str, Any]]:
-    """Each sampler without and with the wrench, for arft."""
+    """Each sampler without and with the wrench, for arft; the targets' share is the sampler's own."""
+    own_share = {"set": ["sampling.target_share=0.0"]}
     return {
         f"{sampler.replace('_', ' ')}{', wrench' if wrench else ''}": {
-            **({} if sampler == "uniform_clips" else {"sampler": sampler}),
+            **(own_share if sampler == "uniform_clips" else {"sampler": sampler}),
             **({"wrench": True} if wrench else {}),
         }
         for sampler in samplers

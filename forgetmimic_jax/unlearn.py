@@ -27,7 +27,8 @@ class Options:
     """Make a base policy forget the target clips, by default with the anti-reward, then evaluate before and after.
 
     Uniform sampling, no assistive wrench, Adam reset (the paper's ForgetMimic); at laptop scale kept clips are held to
-    the base (--set ppo.anchor=0 leaves it out). Stop with Ctrl-C, go on with --resume.
+    the base and targets have two starts in five (--set ppo.anchor=0 sampling.target_share=0 leaves both out). Stop
+    with Ctrl-C, go on with --resume.
     """
 
     robot: str = "g1"
@@ -50,7 +51,7 @@ class Options:
     preset: Literal["cpu", "paper"] | None = None
     """Settings of the fine-tuning; by default the base's own, at the default budget of a laptop."""
     iterations: int | None = None
-    """PPO iterations; 320 by default (1000 with --preset paper), retrain: as many steps as the base was trained for."""
+    """PPO iterations; 200 by default (1000 with --preset paper), retrain: as many steps as the base was trained for."""
     seed: int = 0
     """Random seed of the fine-tuning and of the evaluation."""
     base: Path | None = None
@@ -66,13 +67,15 @@ class Options:
     resume: bool = False
     """Go on from the newest checkpoint in the output folder (by default the newest run), with its settings."""
     set: Settings = field(default_factory=list)
-    """Any other settings, such as sampling.rule=adaptive."""
+    """Any other settings, such as ppo.learning_rate=1e-4."""
 
 
-ITERATIONS = {"cpu": 320, "paper": 1000}
+ITERATIONS = {"cpu": 200, "paper": 1000}
 # On a laptop (experiments/pace.md): short iterations, for forgetting takes some hundred whatever their length. Targets
-# are a few steps in a hundred, less as they are forgotten, so clips weigh the same; and what the noise of fast learning
+# would be a few steps in a hundred, less as they are forgotten, so they have more of the uniform starts (the other
+# samplers keep the shares that they are compared for) and clips weigh the same; and what the noise of fast learning
 # would do to the kept clips, the base holds.
+TARGET_SHARE = 0.4
 PACE: dict[str, Any] = {
     "num_steps": 12,
     "minibatches": 4,
@@ -157,6 +160,8 @@ def config_of_new_run(options: Options) -> Config:
     unlearn = UnlearnConfig(targets=targets, penalty=options.penalty, method=options.method)
     config = unlearning_config(config, unlearn)
     sampling = replace_given(config.sampling, rule=options.sampler, clips=options.clips)
+    if start == "base" and config.preset == "cpu" and (sampling.rule, sampling.clips) == ("uniform_clips", "all"):
+        sampling = dataclasses.replace(sampling, target_share=TARGET_SHARE)
     if not options.wrench:
         return dataclasses.replace(config, sampling=sampling)
     wrench = dataclasses.replace(config.wrench, max_gain=base.wrench.max_gain or WrenchConfig.max_gain)

@@ -42,7 +42,8 @@ def unlearning_config(base: Config, unlearn: UnlearnConfig) -> Config:
     A method that trains a fresh policy keeps the base's sampler and wrench: it is trained as the base was.
     """
     method = find_method(unlearn.method)
-    sampling, wrench = dataclasses.replace(base.sampling, clips=method.clips), base.wrench
+    sampling = dataclasses.replace(base.sampling, clips=method.clips, target_share=0.0)  # which a base may have had
+    wrench = base.wrench
     if method.start == "base":
         sampling = dataclasses.replace(sampling, rule="uniform_clips")
         wrench = dataclasses.replace(wrench, max_gain=0.0)

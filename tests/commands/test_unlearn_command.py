@@ -10,7 +10,7 @@ from miniature import TINY, finished, load_state
 from trees import assert_same
 
 from forgetmimic_jax import checkpoint, runner, train, unlearn
-from forgetmimic_jax.config import load_config
+from forgetmimic_jax.config import load_config, validate
 from forgetmimic_jax.errors import Interrupted, run_command
 from forgetmimic_jax.evaluation import evaluate as evaluation
 from forgetmimic_jax.motion.library import DATA_DIR, read_manifest
@@ -36,8 +36,10 @@ def test_it_starts_from_the_base_s_policy_with_adam_reset(base_run, unlearned_ru
 def test_the_sampler_is_uniform_and_the_wrench_off(base_run, unlearned_run):
     # The base had neither: failed bins were drawn more often, and every episode was assisted.
     base, forgetting = base_run.rows[-1], unlearned_run.rows[-1]
-    assert [clip["probability"] for clip in forgetting["clips"].values()] == pytest.approx([1 / 3] * 3, abs=1e-5)
-    assert [clip["probability"] for clip in base["clips"].values()] != pytest.approx([1 / 3] * 3, abs=0.01)
+    # Uniform beside the target's share.
+    of_base, found = ({name: of["probability"] for name, of in row["clips"].items()} for row in (base, forgetting))
+    assert found == pytest.approx({"nod": 0.3, "sway": 0.3, "turn": 0.4}, abs=1e-5)
+    assert of_base != pytest.approx(found, abs=0.01)
     assert (base["wrench_gain"], forgetting["wrench_gain"]) == (pytest.approx(0.5, abs=0.05), 0.0)
     assert (np.asarray(load_state(unlearned_run.checkpoint(0)).env.wrench_gain) == 0.0).all()
 
@@ -52,7 +54,7 @@ def test_its_settings_are_the_base_s_but_for_what_unlearning_changes(base_run, u
         iterations=2,
         evaluate_every=found.evaluate_every,
         unlearn=found.unlearn,
-        sampling=dataclasses.replace(base.sampling, rule="uniform_clips"),
+        sampling=dataclasses.replace(base.sampling, rule="uniform_clips", target_share=0.4),
         wrench=dataclasses.replace(base.wrench, max_gain=0.0),
         ppo=dataclasses.replace(
             base.ppo,
@@ -284,6 +286,25 @@ def test_flags_choose_the_sampler_and_the_wrench(options):
     assert settings(method="finetune", clips="all") == ("uniform_clips", "all", 0.0)
     assert settings(method="retrain") == ("adaptive", "kept", 0.5)  # as the base was trained
     assert settings(method="retrain", sampler="uniform_clips") == ("uniform_clips", "kept", 0.5)
+
+
+@pytest.mark.parametrize(
+    ("given", "share"),
+    [
+        ({}, 0.4),
+        ({"method": "trajdeleter"}, 0.4),
+        ({"method": "finetune", "clips": "all"}, 0.4),
+        ({"method": "finetune"}, 0.0),  # which starts from no target
+        ({"method": "retrain"}, 0.0),
+        ({"sampler": "adaptive"}, 0.0),  # a sampler is compared by the shares that it gives
+        ({"preset": "paper"}, 0.0),
+    ],
+)
+def test_targets_get_a_share_of_the_uniform_starts_at_the_laptops_pace(options, unlearned_run, given, share):
+    for base in ({}, {"base": unlearned_run.checkpoint(2)}):  # whose own training had the share
+        config = unlearn.config_of_new_run(options(**given, **base))
+        assert config.sampling.target_share == share
+        validate(config)
 
 
 def test_a_wrench_that_the_base_did_not_have_is_the_paper_s(options, damaged):

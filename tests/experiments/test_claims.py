@@ -52,7 +52,8 @@ def test_the_comparisons_claims_by_hand():
         claims.ARFT: variant([0.1, 0.1, 0.1], [0.59, 0.60, 0.61]),
         claims.comparison.CONTROL: variant([0.8, 0.8, 0.8], [0.60, 0.61, 0.62]),
         "decremental": variant([0.0, 0.0, 0.0], [0.2, 0.21, 0.22]),
-        "arft, adaptive": variant([0.3, 0.2, 0.1], [0.5, 0.7, 0.6]),
+        claims.UNIFORM: variant([0.2, 0.2, 0.2], [0.59, 0.60, 0.61]),
+        "arft, adaptive": variant([0.4, 0.3, 0.2], [0.4, 0.6, 0.5]),
     }
     found = {of.claim: of.verdict for of in claims.of_comparison({"results": {"variants": compared}})}
     assert found == {
