@@ -104,6 +104,9 @@ def distill(options: Options) -> None:
         checkpoint.check_matches(of, setup.robot, library, setup.library_hash, config)
         return checkpoint.load_policy(path, shapes)
 
+    for teacher in options.teachers:
+        if not all(teacher.partition("=")):
+            raise InputError(f"--teachers: found '{teacher}'; accepted: CLIP=CHECKPOINT")
     named = dict(teacher.partition("=")[::2] for teacher in options.teachers)
     runner.check_targets(tuple({*named, *options.found}), library.names)
     student = load(options.student)

@@ -105,28 +105,28 @@ def main(options: Options) -> None:
     setup = runner.with_base(runner.make_setup(on_engine(config, options.physics)))
     info = checkpoint.read_info(runner.base_checkpoint(config))
     description = f"forget {', '.join(config.unlearn.targets)}"
-    if config.unlearn.method == "finetune" and config.sampling.clips == "all":
+    method = method_of(config)
+    if method.result == "fine_tuned" and config.sampling.clips == "all":
         description = "fine-tune on all clips"  # which is no forgetting
     elif config.unlearn.method != UnlearnConfig.method:
         description += f" by {config.unlearn.method}"
     path, state = runner.run(setup, output, description=description, resume=options.resume)
-    result = method_of(config).result
     try:
         document = evaluate(
             setup.config,
             setup.robot,
             setup.library,
             setup.library_hash,
-            {"base": setup.assets.base, result: state.policy},
+            {"base": setup.assets.base, method.result: state.policy},
             checkpoint=str(path),
             targets=config.unlearn.targets,
             episodes=options.episodes,
             seed=config.seed,
-            budget={"base": cost(info), result: cost(checkpoint.read_info(path))},
+            budget={"base": cost(info), method.result: cost(checkpoint.read_info(path))},
         )
     except KeyboardInterrupt:
         raise runner.interrupted(config, output) from None
-    name = f"{result.replace('_', '-')} policy"
+    name = f"{method.result.replace('_', '-')} policy"
     files = {name: path, **show_and_write(output, document), "curves": output / "metrics.jsonl"}
     closing(files, f"make evaluate ROBOT={config.robot} CHECKPOINT={path} EPISODES=100")
 

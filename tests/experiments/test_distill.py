@@ -99,4 +99,7 @@ def test_errors_come_before_anything_is_written(library_folder, tiny_config, tmp
         distill.distill(distill.Options(output, student=student, teachers=(f"swy={student}",)))
     with pytest.raises(InputError, match="no such checkpoint folder"):
         distill.distill(distill.Options(output, student=student, teachers=(f"sway={tmp_path / 'none'}",)))
+    for incomplete in ("sway", "sway=", f"={student}"):
+        with pytest.raises(InputError, match="accepted: CLIP=CHECKPOINT"):
+            distill.distill(distill.Options(output, student=student, teachers=(incomplete,)))
     assert not output.exists()
