@@ -140,7 +140,7 @@ def main() -> None:
     tables |= {
         name: table(RESULTS / name, of) for name, of in (("share", SHARE), ("shipped", SHIPPED), ("earlier", EARLIER))
     }
-    shares = {}
+    shares: dict[str, float] = {}
     for key, file in (("", "held"), ("none_", "share/none"), ("share_", "share/forty_per_cent")):
         of_steps = json.loads((RESULTS / f"{file}.json").read_text())["target_step_share"]
         shares |= {f"{key}first": 100 * np.mean(of_steps[1:6]), f"{key}last": 100 * np.mean(of_steps[-5:])}
