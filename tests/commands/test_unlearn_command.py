@@ -38,7 +38,7 @@ def test_the_sampler_is_uniform_and_the_wrench_off(base_run, unlearned_run):
     base, forgetting = base_run.rows[-1], unlearned_run.rows[-1]
     # Uniform beside the target's share.
     of_base, found = ({name: of["probability"] for name, of in row["clips"].items()} for row in (base, forgetting))
-    assert found == pytest.approx({"nod": 0.3, "sway": 0.3, "turn": 0.4}, abs=1e-5)
+    assert found == pytest.approx({"nod": 0.25, "sway": 0.25, "turn": 0.5}, abs=1e-5)
     assert of_base != pytest.approx(found, abs=0.01)
     assert (base["wrench_gain"], forgetting["wrench_gain"]) == (pytest.approx(0.5, abs=0.05), 0.0)
     assert (np.asarray(load_state(unlearned_run.checkpoint(0)).env.wrench_gain) == 0.0).all()
@@ -54,7 +54,7 @@ def test_its_settings_are_the_base_s_but_for_what_unlearning_changes(base_run, u
         iterations=2,
         evaluate_every=found.evaluate_every,
         unlearn=found.unlearn,
-        sampling=dataclasses.replace(base.sampling, rule="uniform_clips", target_share=0.4),
+        sampling=dataclasses.replace(base.sampling, rule="uniform_clips", target_share=0.5),
         wrench=dataclasses.replace(base.wrench, max_gain=0.0),
         ppo=dataclasses.replace(
             base.ppo,
@@ -291,9 +291,9 @@ def test_flags_choose_the_sampler_and_the_wrench(options):
 @pytest.mark.parametrize(
     ("given", "share"),
     [
-        ({}, 0.4),
-        ({"method": "trajdeleter"}, 0.4),
-        ({"method": "finetune", "clips": "all"}, 0.4),
+        ({}, 0.5),
+        ({"method": "trajdeleter"}, 0.5),
+        ({"method": "finetune", "clips": "all"}, 0.5),
         ({"method": "finetune"}, 0.0),  # which starts from no target
         ({"method": "retrain"}, 0.0),
         ({"sampler": "adaptive"}, 0.0),  # a sampler is compared by the shares that it gives
