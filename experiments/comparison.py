@@ -39,8 +39,14 @@ def measure(lab: Lab) -> dict[str, Any]:
 
 def tell(document: Mapping[str, Any]) -> str:
     """The table, and the differences from base and fine-tuned control, seed by seed."""
-    variants = document["results"]["variants"]
+    variants, asked = document["results"]["variants"], document["asked"]
     parts = [variant_table(variants, paper.COMPARISON)]
+    if "retrained" in variants:
+        parts.append(
+            f"*retrained*: {asked['control_iterations']:,} iterations from scratch with the base's own settings, which "
+            f"took {asked['base_environment_steps']:,} environment steps to make the base. *arft* is λ = 16; the rows "
+            "by sampler are too, each at the shares of the starts that its rule gives.\n"
+        )
     if CONTROL in variants:
         header = ["", "kept success - base's, points", "- the control's", "kept tracking - base's", "- the control's"]
         rows = [[label, *differences(variants, label)] for label in variants]
