@@ -20,7 +20,7 @@ from rich.markdown import Markdown
 
 from forgetmimic_jax.config import Config, preset
 from forgetmimic_jax.console import closing, progress
-from forgetmimic_jax.errors import InputError, run_command
+from forgetmimic_jax.errors import InputError, Interrupted, run_command
 from forgetmimic_jax.evaluation.plots import save
 from forgetmimic_jax.evaluation.variants import over_seeds, summary, variant_bars, variant_table
 from forgetmimic_jax.motion.clip import write_atomically
@@ -128,6 +128,7 @@ class Lab:
         runner.check_targets(self.targets, self.info.clips)
         self.seeds = tuple(range(options.seeds))
         self.failed: dict[str, str] = {}
+        self.stopped: Interrupted | None = None
         self.known = known or {}
 
     @property
@@ -198,6 +199,8 @@ class Lab:
     ) -> dict[str, Any]:
         """Every variant with every seed, and what they have in common over the seeds; runs only what is not known.
 
+        Ctrl-C leaves the trials that are finished by then, and `stopped` says so.
+
         Args:
             variants: by label, options of `forgetmimic_jax.unlearn`.
             what: is being done.
@@ -208,7 +211,16 @@ class Lab:
         options = {(label, seed): {**variants[label], "seed": seed} for label, seed in asked}
         names = {key: self.trial(variant).folder.name for key, variant in options.items()}
         missing = {key: variant for key, variant in options.items() if names[key] not in self.known}
-        folders = self.run(missing, what, others=len(missing) < len(options)) if missing else {}
+        folders: dict[tuple[str, int], Path] = {}
+        try:
+            folders = self.run(missing, what, others=len(missing) < len(options)) if missing else {}
+        except Interrupted as stop:
+            trials = {key: self.trial(variant) for key, variant in missing.items()}
+            folders = {key: trial.folder for key, trial in trials.items() if trial.evaluation.is_file()}
+            if not folders and len(missing) == len(options):
+                raise
+            self.stopped = stop
+            self.failed |= {trial.folder.name: "stopped" for key, trial in trials.items() if key not in folders}
         found = {key: self.known[name] for key, name in names.items() if name in self.known}
         found |= {key: summary(folder) for key, folder in folders.items()}
         result = {}
@@ -267,13 +279,17 @@ def known_trials(folder: Path) -> dict[str, Any]:
 
 
 def conduct(study: Study, options: Options, next_command: str) -> None:
-    """Measure what the JSON does not hold already, and tell it; exit code 1 where a trial failed."""
+    """Measure what the JSON does not hold already, and tell it; exit code 1 where a trial failed.
+
+    Raises:
+        Interrupted: stopped; what was finished is told if the study can tell a part of it.
+    """
     from forgetmimic_jax import runner
 
     folder = options.output or RESULTS / options.robot
     runner.check_writable(folder)
     path = folder / f"{study.name}.json"
-    document = _read(path)
+    document, stopped = _read(path), None
     if options.draw:
         if document is None:
             raise InputError(f"{path}: not measured yet; leave --draw out")
@@ -282,7 +298,7 @@ def conduct(study: Study, options: Options, next_command: str) -> None:
         lab = Lab(options, iterations, known_trials(folder))
         asked = lab.asked() | {"asks": list(study.asks)}
         if document is None or document["asked"] != asked or document["failed"]:
-            results = study.measure(lab)
+            results, stopped = study.measure(lab), lab.stopped
             document = {"schema": 1, "study": study.name, "asked": asked, "failed": lab.failed, "results": results}
             folder.mkdir(parents=True, exist_ok=True)
             write_atomically(path, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
@@ -294,6 +310,8 @@ def conduct(study: Study, options: Options, next_command: str) -> None:
     console = Console()
     console.print(Markdown(study.tell(document)))
     closing(files, next_command, console=console)
+    if stopped:
+        raise stopped
     if document["failed"]:
         print(f"{len(document['failed'])} trials failed; the same command tries them again", file=sys.stderr)
         sys.exit(1)

@@ -12,7 +12,7 @@ from miniature import Run, finished
 from scipy import stats
 
 from forgetmimic_jax import study, sweep, trials, unlearn
-from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.errors import InputError, Interrupted
 from forgetmimic_jax.options import parse
 
 STUDIES = (
@@ -183,6 +183,33 @@ def test_a_trial_that_fails_is_told_on_the_page_and_in_the_exit_code(swept, base
     assert seeds == "0"
     sweep.main(asked)  # tries what failed again
     assert results() == ({}, "0 1")
+
+
+def test_what_is_finished_when_it_is_stopped_is_told(swept, base_run, tmp_path, monkeypatch):
+    asked = options(sweep.Options, base_run, tmp_path, kind="seeds")
+    name = next((swept[0] / "trials").glob("*-s0-*/")).name
+
+    def stop(after):
+        def stand_in(asked, **_):
+            for trial in asked[:after]:
+                shutil.copytree(swept[0] / "trials" / name, trial.folder)
+            raise Interrupted("stopped")
+
+        with monkeypatch.context() as patch:
+            patch.setattr(trials, "run_trials", stand_in)
+            with pytest.raises(Interrupted):
+                sweep.main(asked)
+
+    stop(after=0)
+    assert not (tmp_path / "out").exists()
+    stop(after=1)
+    document = json.loads((tmp_path / "out" / "seeds.json").read_text())
+    assert list(document["results"]["variants"]["λ = 16"]["seeds"]) == ["0"]
+    assert list(document["failed"].values()) == ["stopped"]
+    assert "`: stopped\n" in (tmp_path / "out" / "seeds.md").read_text()
+    stop(after=0)  # and asked again, it goes on with what is missing
+    document = json.loads((tmp_path / "out" / "seeds.json").read_text())
+    assert list(document["results"]["variants"]["λ = 16"]["seeds"]) == ["0"]
 
 
 def test_where_every_trial_fails_nothing_is_written(refused, base_run, tmp_path, monkeypatch):
