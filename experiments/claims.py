@@ -7,6 +7,7 @@ and is open between. With one seed there is no interval, and the word is only wh
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -154,22 +155,21 @@ def of_physical_behaviour(document: Mapping[str, Any]) -> Iterator[Finding]:
 
 
 def of_relearning(document: Mapping[str, Any]) -> Iterator[Finding]:
-    """Fig. 8, with the control that the paper lacks."""
+    """Fig. 8, with the controls that the paper lacks."""
     base, starts = document["results"]["base"], document["results"]["starts"]
-    if not {"unlearned", "retrained"} <= starts.keys():
-        return
-    for share in relearning.SHARES:
+    controls = [label for label in ("distilled", "retrained") if {"unlearned", label} <= starts.keys()]
+    for control, share in itertools.product(controls, relearning.SHARES):
         mine, theirs = (
             [found[1] for curve in starts[label].values() if (found := relearning.crossing(curve, share * base))]
-            for label in ("unlearned", "retrained")
+            for label in ("unlearned", control)
         )
-        claim = f"{share:.0%} of the tracking comes back no sooner than it comes to a policy that never had it"
+        claim = f"{share:.0%} of the tracking comes back no sooner than it comes to a {control} policy"
         if not mine or not theirs:
-            never = " and ".join(label for label, of in (("unlearned", mine), ("retrained", theirs)) if not of)
+            never = " and ".join(label for label, of in (("unlearned", mine), (control, theirs)) if not of)
             yield Finding(claim, "open" if not mine else "does not hold", f"not reached within the run: {never}")
             continue
         found_mine, mean = statistics.over_seeds(mine), float(np.mean(theirs))
-        evidence = f"{number(found_mine, 0)} target steps from the unlearned policy, {mean:,.0f} from the retrained"
+        evidence = f"{number(found_mine, 0)} target steps from the unlearned policy, {mean:,.0f} from the {control}"
         yield Finding(claim, judged(found_mine, mean, below=False), evidence)
 
 

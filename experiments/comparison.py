@@ -21,7 +21,7 @@ METHODS: dict[str, dict[str, Any]] = {
         name.replace("_", " "): {"method": name}
         for name in (
             *("random_reward", "decremental", "poisoning", "trajdeleter"),
-            *("negated_reward", "gradient_ascent", "policy_edit"),
+            *("negated_reward", "gradient_ascent", "policy_edit", "distill"),
         )
     },
     "arft": {},

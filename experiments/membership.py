@@ -33,6 +33,7 @@ def measure(lab: Lab) -> dict[str, Any]:
         {
             **{("λ = 16", seed): {"seed": seed} for seed in lab.seeds},
             **{("fine-tuned, all clips", s): {"method": "finetune", "clips": "all", "seed": s} for s in lab.seeds},
+            **{("distilled", seed): {"method": "distill", "seed": seed} for seed in lab.seeds},
             **{
                 ("retrained", seed): {"method": "retrain", "iterations": lab.control_iterations, "seed": seed}
                 for seed in lab.control_seeds

@@ -1,7 +1,8 @@
 """How fast does a forgotten motion come back, and how fast does one that was never there come? (paper, fig. 8)
 
-Plain fine-tuning on all clips, from the unlearned policy, from one retrained without the targets, and from scratch. If
-the unlearned policy needs far fewer target steps than the retrained one, the motion was hidden and not forgotten.
+Plain fine-tuning on all clips, from the unlearned policy, from one that learned the kept clips from the base and never
+lived a target, from one retrained without the targets, and from scratch. If the unlearned policy needs far fewer target
+steps than those that never had them, the motion was hidden and not forgotten.
 """
 
 from __future__ import annotations
@@ -29,9 +30,9 @@ SHARES = (0.5, 0.8, 0.95)  # of the base's survival-weighted tracking on the tar
 
 def measure(lab: Lab) -> dict[str, Any]:
     """First the policies to start from, then their relearning."""
-    starts: dict[tuple[str, int], dict[str, Any]] = {
-        ("unlearned", seed): {"seed": seed, "iterations": ITERATIONS[lab.options.budget]} for seed in lab.seeds
-    }
+    given = {"iterations": ITERATIONS[lab.options.budget]}
+    starts: dict[tuple[str, int], dict[str, Any]] = {("unlearned", seed): {**given, "seed": seed} for seed in lab.seeds}
+    starts |= {("distilled", seed): {**given, "method": "distill", "seed": seed} for seed in lab.seeds}
     retrain = {"method": "retrain", "iterations": lab.control_iterations}
     starts |= {("retrained", seed): {**retrain, "seed": seed} for seed in lab.control_seeds}
     folders = lab.run(starts, "policies to relearn from")

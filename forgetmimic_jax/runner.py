@@ -86,7 +86,7 @@ def start_state(setup: Setup) -> TrainState:
     """
     config, unlearning = setup.config, bool(setup.config.unlearn.targets)
     key = jax.random.PRNGKey(config.seed)
-    if method_of(config).start == "fresh" or (config.base is None and not unlearning):
+    if method_of(config).start != "base" or (config.base is None and not unlearning):
         return jax.jit(lambda assets, key: init_state(setup.env, assets, key))(setup.assets, key)
     policy, failure_level = base_policy(setup), None
     by_failure = config.sampling.rule == "adaptive" or config.wrench.max_gain > 0

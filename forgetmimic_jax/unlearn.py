@@ -37,9 +37,9 @@ class Options:
     """Clips to forget, comma-separated; the library's default targets (g1: punch,kick) by default."""
     method: str = "arft"
     """How, by the name of a file of forgetmimic_jax/unlearning:
-    arft (the paper's), retrain, finetune, random_reward,
-    negated_reward, gradient_ascent, trajdeleter,
-    poisoning, decremental or policy_edit."""
+    arft (the paper's), distill, retrain, finetune,
+    random_reward, negated_reward, gradient_ascent,
+    trajdeleter, poisoning, decremental or policy_edit."""
     penalty: float = 16.0
     """Penalty λ of arft on the targets' normalised tracking reward; W = 8 is the paper's edge."""
     sampler: Literal["uniform_clips", "uniform_bins", "frozen", "adaptive"] | None = None
@@ -47,7 +47,7 @@ class Options:
     wrench: bool = False
     """Assist by the wrench, as strongly as the base's training did (at most 0.6 where it had none)."""
     clips: Literal["all", "kept"] | None = None
-    """Clips that episodes start from; all by default, retrain and finetune: kept."""
+    """Clips that episodes start from; all by default; distill, retrain, finetune: kept."""
     preset: Literal["cpu", "paper"] | None = None
     """Settings of the fine-tuning; by default the base's own, at the default budget of a laptop."""
     iterations: int | None = None
@@ -86,6 +86,8 @@ PACE: dict[str, Any] = {
     "equal_clips": True,
     "anchor": 0.1,
 }
+# A fresh policy learns from what the base would do, which has little noise: many small updates.
+TAUGHT: dict[str, Any] = {"minibatches": 12, "epochs": 4, "anchor": 1.0}
 
 
 def main(options: Options) -> None:
@@ -146,14 +148,17 @@ def config_of_new_run(options: Options) -> Config:
         ppo = dataclasses.replace(config.ppo, **layers)
         config = dataclasses.replace(config, library=base.library, sampling=sampling, ppo=ppo)
     iterations, start = ITERATIONS[options.preset or "cpu"], find_method(options.method).start
-    if start == "base" and config.preset == "cpu":
-        # A base's last training may have been slowed down to settle it, and forgetting has to be done in its budget:
-        # fast at first, settling what is kept at the end. The targets' values change sign, which a clip would slow.
-        config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, **PACE))
-    elif start == "fresh":
+    if start == "fresh":
         # The base may be an unlearned policy, whose settings held it to its own base.
         config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, anchor=0.0))
         iterations = max(1, round(info.environment_steps / (config.ppo.num_envs * config.ppo.num_steps)))
+    elif config.preset == "cpu":
+        # A base's last training may have been slowed down to settle it, and forgetting has to be done in its budget:
+        # fast at first, settling what is kept at the end. The targets' values change sign, which a clip would slow.
+        config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, **PACE))
+    if start == "taught":
+        taught = TAUGHT if config.preset == "cpu" else {"anchor": TAUGHT["anchor"]}
+        config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, **taught))
     config = dataclasses.replace(config, base=None, evaluate_every=0, iterations=iterations)
     config = replace_given(config, robot=options.robot, seed=options.seed, library=options.library, base=options.base)
     targets = runner.default_targets(config) if options.targets is None else comma_separated(options.targets)

@@ -32,7 +32,8 @@ class Method:
         observation: (actor observation [env, features], is_target bool[env]) → what the actor sees in training.
         loss: (config, batch, what the networks say now, iteration i32[]) → the loss [] to minimise and its parts.
         clips: which clips episodes start from, unless the user says otherwise (`sampling.clips`).
-        start: from the base with uniform sampling and no wrench, or a fresh policy with the base's own settings.
+        start: from the base with uniform sampling and no wrench; a fresh policy that the base teaches, the same way; or
+            a fresh policy with the base's own settings.
         simulate: whether steps are simulated, or reference states with reset noise stand for them.
         result: what evaluation.json calls the policy.
     """
@@ -41,6 +42,6 @@ class Method:
     observation: Callable[[Array, Array], Array] = plain_observation
     loss: Callable[[Config, Batch, Prediction, Array], tuple[Array, dict[str, Array]]] = ppo_loss
     clips: Literal["all", "kept"] = "all"
-    start: Literal["base", "fresh"] = "base"
+    start: Literal["base", "taught", "fresh"] = "base"
     simulate: bool = True
     result: Literal["unlearned", "retrained", "fine_tuned"] = "unlearned"

@@ -39,12 +39,12 @@ def method_of(config: Config) -> Method:
 def unlearning_config(base: Config, unlearn: UnlearnConfig) -> Config:
     """The base's run as an unlearning run: the method on, its clips, the sampler uniform, the wrench off; no more.
 
-    A method that trains a fresh policy keeps the base's sampler and wrench: it is trained as the base was.
+    A method that trains a fresh policy on its own keeps the base's sampler and wrench: it is trained as the base was.
     """
     method = find_method(unlearn.method)
     sampling = dataclasses.replace(base.sampling, clips=method.clips, target_share=0.0)  # which a base may have had
     wrench = base.wrench
-    if method.start == "base":
+    if method.start != "fresh":
         sampling = dataclasses.replace(sampling, rule="uniform_clips")
         wrench = dataclasses.replace(wrench, max_gain=0.0)
     return dataclasses.replace(base, unlearn=unlearn, sampling=sampling, wrench=wrench)

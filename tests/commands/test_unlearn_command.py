@@ -14,6 +14,7 @@ from forgetmimic_jax.config import load_config, validate
 from forgetmimic_jax.errors import Interrupted, run_command
 from forgetmimic_jax.evaluation import evaluate as evaluation
 from forgetmimic_jax.motion.library import DATA_DIR, read_manifest
+from forgetmimic_jax.rows import read_rows
 
 
 @pytest.fixture
@@ -286,6 +287,7 @@ def test_flags_choose_the_sampler_and_the_wrench(options):
     assert settings(method="finetune", clips="all") == ("uniform_clips", "all", 0.0)
     assert settings(method="retrain") == ("adaptive", "kept", 0.5)  # as the base was trained
     assert settings(method="retrain", sampler="uniform_clips") == ("uniform_clips", "kept", 0.5)
+    assert settings(method="distill") == ("uniform_clips", "kept", 0.0)
 
 
 @pytest.mark.parametrize(
@@ -296,6 +298,7 @@ def test_flags_choose_the_sampler_and_the_wrench(options):
         ({"method": "finetune", "clips": "all"}, 0.5),
         ({"method": "finetune"}, 0.0),  # which starts from no target
         ({"method": "retrain"}, 0.0),
+        ({"method": "distill"}, 0.0),
         ({"sampler": "adaptive"}, 0.0),  # a sampler is compared by the shares that it gives
         ({"preset": "paper"}, 0.0),
     ],
@@ -318,6 +321,21 @@ def test_a_policy_from_scratch_is_held_by_nothing(options, unlearned_run):
     base = unlearned_run.checkpoint(2)
     anchors = [unlearn.config_of_new_run(options(method=name, base=base)).ppo.anchor for name in ("arft", "retrain")]
     assert anchors == [0.1, 0.0]
+
+
+def test_a_distilled_policy_starts_afresh_and_is_pulled_towards_the_base_at_any_scale(options, base_run, tmp_path):
+    assert unlearn.config_of_new_run(options(method="distill", iterations=None)).iterations == 200
+    assert unlearn.config_of_new_run(options(method="distill", preset="paper")).ppo.anchor == 1.0
+    output = tmp_path / "run"
+    unlearn.main(options(method="distill", iterations=2, episodes=2, output=output))
+    start, base = load_state(output / "checkpoints" / "00000000"), load_state(base_run.checkpoint(4))
+    assert float(start.policy.actor_normalizer.count) == 0.0 < float(base.policy.actor_normalizer.count)
+    rows = read_rows(output / "metrics.jsonl")
+    assert all(row["anchor_kl"] > 0.0 for row in rows)
+    assert all(row["target/step_share"] == 0.0 for row in rows)
+    assert load_config(output / "config.yaml").ppo.anchor == 1.0
+    policies = json.loads((output / "evaluation.json").read_text())["policies"]
+    assert policies.keys() == {"base", "unlearned", "zero_action"}
 
 
 def test_retraining_takes_as_many_steps_as_the_base_did(options):

@@ -12,7 +12,7 @@ from forgetmimic_jax.unlearning.registry import find_method, method_of, methods,
 
 NAMES = {
     *("arft", "retrain", "finetune", "random_reward", "decremental", "poisoning", "trajdeleter", "negated_reward"),
-    *("gradient_ascent", "policy_edit"),
+    *("gradient_ascent", "policy_edit", "distill"),
 }
 
 
@@ -41,6 +41,7 @@ def test_a_method_says_where_it_differs_from_ppo():
     assert {name: changes(name) for name in NAMES} == {
         "arft": {"reward"},
         "retrain": {"clips", "start", "result"},
+        "distill": {"clips", "start"},
         "finetune": {"clips", "result"},
         "random_reward": {"reward"},
         "negated_reward": {"reward"},
