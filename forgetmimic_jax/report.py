@@ -31,10 +31,10 @@ class Options:
     """Folder of the run, with its evaluation.json."""
     base: Path | None = None
     """Checkpoint that the run started from; the one its settings name by default."""
-    retrained: Path | None = None
-    """Run of `make unlearn ARGS='--method retrain'` with the same targets and evaluation, to compare with."""
+    control: Path | None = None
+    """Run of `make unlearn METHOD=distill` (or retrain) with the same targets and evaluation, to compare with."""
     relearning: Path | None = None
-    """JSON of experiments/relearning.py with the same targets: how fast unlearned and retrained policy relearn them."""
+    """JSON of experiments/relearning.py with the same targets: how fast unlearned policy and control relearn them."""
     films: int = 4
     """Clips to film for at most 4 s: the targets, then those the base does best; one in the run's videos/ is taken."""
     output: Path | None = None
@@ -68,9 +68,9 @@ def main(options: Options) -> None:
     runner.check_writable(output.parent)
     info = checkpoint.read_info(path)
     base = _base(options, document, info)
-    retrained = None if options.retrained is None else _retrained(options.retrained, document)
+    control = None if options.control is None else _control(options.control, document)
     relearning = None if options.relearning is None else _relearning(options.relearning, document)
-    verdict = judge(document["policies"], retrained=retrained, relearning=relearning)
+    verdict = judge(document["policies"], control=control, relearning=relearning)
     rows = [row for row in read_rows(options.run / "metrics.jsonl") if "target/lambda_crit" in row]
     films, films_missing = _films(options, document, info, base)
 
@@ -169,16 +169,22 @@ def _base(options: Options, document: Mapping[str, Any], info: CheckpointInfo) -
     return base
 
 
-def _retrained(run: Path, document: Mapping[str, Any]) -> dict[str, Any]:
-    """The retrained policy of another run, measured on the same episodes."""
+def _control(run: Path, document: Mapping[str, Any]) -> dict[str, Any]:
+    """The policy of another run that never lived the targets, measured on the same episodes."""
+    from forgetmimic_jax.config import load_config
+    from forgetmimic_jax.unlearning.registry import method_of
+
     path = run / "evaluation.json"
+    method = method_of(load_config(run / "config.yaml"))
+    if method.start == "base":
+        raise InputError(f"{run}/config.yaml: unlearn.method: a control starts afresh, by distill or retrain")
     try:
         other = json.loads(path.read_text())
-        policy = other["policies"]["retrained"]
+        policy = other["policies"][method.result]
     except FileNotFoundError:
         raise InputError(f"{path}: not found") from None
     except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: no evaluation of a retrained policy: {type(error).__name__}: {error}") from None
+        raise InputError(f"{path}: no evaluation of a control: {type(error).__name__}: {error}") from None
     for field in ("robot", "library_hash", "targets", "seed", "episodes"):
         if other.get(field) != document[field]:
             raise InputError(f"{path}: {field}: found {other.get(field)}; the unlearned run's is {document[field]}")
@@ -191,14 +197,15 @@ def _relearning(path: Path, document: Mapping[str, Any]) -> dict[str, float | No
         study = json.loads(path.read_text())
         asked, results = study["asked"], study["results"]
         found = {}
-        for start in ("unlearned", "retrained"):
+        control = "distilled" if "distilled" in results["starts"] else "retrained"
+        for who, start in (("unlearned", "unlearned"), ("control", control)):
             until = [
                 next((steps for tracking, steps in zip(curve["tracking"], curve["target_steps"], strict=True)
                       if tracking >= RELEARNED * results["base"]), None)
                 for curve in results["starts"][start].values()
             ]  # fmt: skip
             reached = [steps for steps in until if steps is not None]
-            found[start] = sum(reached) / len(reached) if reached and len(reached) == len(until) else None
+            found[who] = sum(reached) / len(reached) if reached and len(reached) == len(until) else None
     except FileNotFoundError:
         raise InputError(f"{path}: not found") from None
     except (ValueError, KeyError, TypeError, AttributeError) as error:
@@ -305,8 +312,8 @@ def _limits(document: Mapping[str, Any], options: Options) -> list[str]:
         "Not tested: pushes, sensor noise, other floors, clips outside the library, and whether one can tell from the "
         "policy that the targets were once in its library (membership inference).",
     ]
-    if options.retrained is None:
-        limits.append("Not tested: whether it behaves like a policy retrained without the targets.")
+    if options.control is None:
+        limits.append("Not tested: whether it behaves like a policy that never lived the targets.")
     if options.relearning is None:
         limits.append("Not tested: how fast fine-tuning would bring the targets back.")
     if success["mean"] < 0.5:
@@ -346,7 +353,7 @@ def _commands(options: Options, document: Mapping[str, Any], info: CheckpointInf
     if changed:
         words.append(f"--set {' '.join(changed)}")
     page = [f"--run {options.run}"]
-    page += [f"--{name} {value}" for name in ("base", "retrained", "relearning") if (value := getattr(options, name))]
+    page += [f"--{name} {value}" for name in ("base", "control", "relearning") if (value := getattr(options, name))]
     return [
         f".venv/bin/python -m forgetmimic_jax.unlearn {' '.join(words)} --output {options.run}",
         f".venv/bin/python -m forgetmimic_jax.report {' '.join(page)}",

@@ -24,13 +24,14 @@ def _bound(share: float) -> str:
 RULES = {
     CONSISTENT: (
         f"The targets' skill left is at most {_bound(FORGOTTEN)} and the kept clips' at least {_bound(KEPT)}, both "
-        f"with their whole 95 % intervals; on the targets the intervals of tracking of the unlearned and the retrained "
-        f"policy overlap; and to relearn the targets to 80 % of the base, the unlearned policy needs at least "
-        f"{_bound(FASTER)} of the target transitions that the retrained one needs."
+        f"with their whole 95 % intervals; on the targets the intervals of tracking of the unlearned policy and of the "
+        f"control overlap; and to relearn the targets to 80 % of the base, the unlearned policy needs at least "
+        f"{_bound(FASTER)} of the target transitions that the control needs. The control has never lived a target: it "
+        f"was retrained without them, or learned the kept clips from the base."
     ),
     RECOVERABLE: (
         f"Forgotten and kept as above, but the unlearned policy relearns the targets with less than {_bound(FASTER)} "
-        f"of the target transitions that the retrained policy needs, or is the only one of the two that does."
+        f"of the target transitions that the control needs, or is the only one of the two that does."
     ),
     INCONCLUSIVE: "None of the other rules holds: an interval spans a bound, or a comparison was not made.",
     FAILED: (
@@ -51,16 +52,16 @@ class Verdict:
 def judge(
     policies: Mapping[str, Any],
     *,
-    retrained: Mapping[str, Any] | None = None,
+    control: Mapping[str, Any] | None = None,
     relearning: Mapping[str, float | None] | None = None,
 ) -> Verdict:
     """The verdict on the policy `unlearned` of an evaluation.
 
     Args:
         policies: the `policies` of its evaluation.json, with base, unlearned and zero_action.
-        retrained: the same policy's entry for one retrained without the targets, on the same episodes.
+        control: the entry of a policy that never lived the targets, retrained or distilled, on the same episodes.
         relearning: target transitions until 80 % of the base's tracking on the targets is regained, for `unlearned` and
-            `retrained`; None where that was not reached.
+            `control`; None where that was not reached.
     """
     unlearned = policies[UNLEARNED]
     left = {group: unlearned[group].get("skill", {}) for group in ("target", "kept")}
@@ -94,10 +95,10 @@ def judge(
         found.append(f"It comes back sooner than it can be learned: {_transitions(relearning)}.")
         return Verdict(RECOVERABLE, tuple(found))
     missing = []
-    if retrained is None:
-        missing.append("It was not compared with a policy retrained without the targets.")
-    elif not _overlap(unlearned["target"], retrained["target"]):
-        missing.append("On the targets it tracks otherwise than the retrained policy: their intervals do not overlap.")
+    if control is None:
+        missing.append("It was not compared with a policy that never lived the targets.")
+    elif not _overlap(unlearned["target"], control["target"]):
+        missing.append("On the targets it tracks otherwise than the control: their intervals do not overlap.")
     if relearning is None:
         missing.append("How fast it relearns the targets was not measured.")
     elif None in relearning.values():
@@ -105,15 +106,15 @@ def judge(
     if missing:
         return Verdict(INCONCLUSIVE, (*found, *missing))
     assert relearning is not None
-    found.append("On the targets its tracking cannot be told from the retrained policy's.")
+    found.append("On the targets its tracking cannot be told from the control's.")
     return Verdict(CONSISTENT, (*found, f"It relearns them no sooner: {_transitions(relearning)}."))
 
 
 def _faster(relearning: Mapping[str, float | None]) -> bool:
-    unlearned, retrained = relearning["unlearned"], relearning["retrained"]
+    unlearned, control = relearning["unlearned"], relearning["control"]
     if unlearned is None:
         return False
-    return retrained is None or unlearned < FASTER * retrained
+    return control is None or unlearned < FASTER * control
 
 
 def _overlap(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
@@ -123,4 +124,4 @@ def _overlap(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
 
 def _transitions(relearning: Mapping[str, float | None]) -> str:
     said = {who: "never" if count is None else f"after {count:,.0f}" for who, count in relearning.items()}
-    return f"unlearned {said['unlearned']}, retrained {said['retrained']} target transitions"
+    return f"unlearned {said['unlearned']}, control {said['control']} target transitions"

@@ -144,8 +144,9 @@ def test_comparisons_enter_the_verdict(run, tmp_path):
         skill = {"mean": mean, "low": mean - 0.1, "high": mean + 0.1, "std": 0.1, "n": 3}
         document["policies"]["unlearned"][group]["skill"] = skill
     (copy / "evaluation.json").write_text(json.dumps(document))
-    control = tmp_path / "retrained"
+    control = tmp_path / "control"
     control.mkdir()
+    (control / "config.yaml").write_text((run / "config.yaml").read_text().replace("method: arft", "method: retrain"))
     policies = {"retrained": document["policies"]["unlearned"]}
     (control / "evaluation.json").write_text(json.dumps(document | {"policies": policies}))
     counts = tmp_path / "relearning.json"
@@ -158,12 +159,12 @@ def test_comparisons_enter_the_verdict(run, tmp_path):
         # The base tracks at 0.5, so 0.4 is relearned; the retrained policy is there after 1000 steps on the targets.
         starts = {"unlearned": {"0": curve(unlearned), "1": curve(unlearned)}, "retrained": {"0": curve(1000)}}
         counts.write_text(json.dumps({"asked": asked, "results": {"base": 0.5, "starts": starts}}))
-        options = report.Options(run=copy, retrained=control, relearning=counts, films=0, output=tmp_path / "r.html")
+        options = report.Options(run=copy, control=control, relearning=counts, films=0, output=tmp_path / "r.html")
         printed = finished(report.main, options).printed
         facts = json.loads((tmp_path / "r.json").read_text())
         assert printed.startswith(f"{facts['verdict']['word']}: ")
-        assert not any("retrained without" in limit or "bring the" in limit for limit in facts["limits"])
-        assert facts["commands"][1].endswith(f"--retrained {control} --relearning {counts}")
+        assert not any("never lived" in limit or "bring the" in limit for limit in facts["limits"])
+        assert facts["commands"][1].endswith(f"--control {control} --relearning {counts}")
         return facts["verdict"]["word"]
 
     assert word(900) == "consistent with retraining"
@@ -210,7 +211,7 @@ def test_without_a_training_log_there_are_no_curves(run, tmp_path):
         ({"films": -1}, "--films: found -1; accepted: 0 or more"),
         ({"output": Path("report.pdf")}, "report.pdf: --output is an .html file"),
         ({"output": Path(__file__) / "r.html"}, f"{__file__}: {__file__} is a file; choose another --output"),
-        ({"retrained": Path("nowhere")}, "nowhere/evaluation.json: not found"),
+        ({"control": Path("nowhere")}, "nowhere/config.yaml: no such config"),
         ({"relearning": Path("nowhere.json")}, "nowhere.json: not found"),
     ],
 )
@@ -255,13 +256,16 @@ def test_comparisons_that_do_not_fit_are_told(refused, run, tmp_path):
     other = tmp_path / "other"
     other.mkdir()
     document = json.loads((run / "evaluation.json").read_text())
+    refusal = f"{run}/config.yaml: unlearn.method: a control starts afresh, by distill or retrain"
+    assert refused(report.main, report.Options(run=run, control=run, output=tmp_path / "r.html")) == refusal
+    (other / "config.yaml").write_text((run / "config.yaml").read_text().replace("method: arft", "method: retrain"))
 
     def told_of(content: dict) -> str:
         (other / "evaluation.json").write_text(json.dumps(content))
-        options = report.Options(run=run, retrained=other, films=0, output=tmp_path / "r.html")
+        options = report.Options(run=run, control=other, films=0, output=tmp_path / "r.html")
         return refused(report.main, options).removeprefix(f"{other}/evaluation.json: ")
 
-    assert told_of(document) == "no evaluation of a retrained policy: KeyError: 'retrained'"
+    assert told_of(document) == "no evaluation of a control: KeyError: 'retrained'"
     fits = document | {"policies": {"retrained": document["policies"]["unlearned"]}}
     assert told_of(fits | {"episodes": 50}) == "episodes: found 50; the unlearned run's is 3"
     assert told_of(fits | {"library_hash": "x"}).startswith("library_hash: found x; the unlearned run's is ")
@@ -289,4 +293,7 @@ def test_a_seed_that_never_relearned_makes_it_never(run, tmp_path):
     results = {"base": 0.5, "starts": {"unlearned": curves, "retrained": {"0": curves["0"]}}}
     path = tmp_path / "relearning.json"
     path.write_text(json.dumps({"asked": asked, "results": results}))
-    assert report._relearning(path, document) == {"unlearned": None, "retrained": 10.0}
+    assert report._relearning(path, document) == {"unlearned": None, "control": 10.0}
+    results["starts"]["distilled"] = {"0": {"tracking": [0.5], "target_steps": [7.0]}}  # as able as the base, so fairer
+    path.write_text(json.dumps({"asked": asked, "results": results}))
+    assert report._relearning(path, document)["control"] == 7.0

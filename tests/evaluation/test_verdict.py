@@ -16,12 +16,12 @@ def policies(target: dict = FORGOTTEN, kept: dict = KEPT) -> dict:
     return {"base": {}, "unlearned": unlearned, "zero_action": {}}
 
 
-def retrained(low: float, high: float) -> dict:
+def never_lived(low: float, high: float) -> dict:
     return {"target": {"survival_weighted_tracking": interval(low, high)}}
 
 
-SLOW = {"unlearned": 60_000, "retrained": 100_000}
-FAST = {"unlearned": 40_000, "retrained": 100_000}
+SLOW = {"unlearned": 60_000, "control": 100_000}
+FAST = {"unlearned": 40_000, "control": 100_000}
 
 
 @pytest.mark.parametrize(
@@ -60,42 +60,42 @@ def test_two_failures_are_both_told():
 
 def test_what_was_not_compared_is_not_consistent():
     assert judge(policies()).reasons[1:] == (
-        "It was not compared with a policy retrained without the targets.",
+        "It was not compared with a policy that never lived the targets.",
         "How fast it relearns the targets was not measured.",
     )
-    assert judge(policies(), retrained=retrained(0.1, 0.2)).word == INCONCLUSIVE
+    assert judge(policies(), control=never_lived(0.1, 0.2)).word == INCONCLUSIVE
     assert judge(policies(), relearning=SLOW).word == INCONCLUSIVE
 
 
 @pytest.mark.parametrize(
     ("control", "relearning", "word"),
     [
-        (retrained(0.15, 0.3), SLOW, CONSISTENT),
-        (retrained(0.0, 0.1), SLOW, CONSISTENT),  # they touch
-        (retrained(0.15, 0.3), {"unlearned": 50_000, "retrained": 100_000}, CONSISTENT),  # half is not less than half
-        (retrained(0.21, 0.3), SLOW, INCONCLUSIVE),
-        (retrained(0.0, 0.09), SLOW, INCONCLUSIVE),
-        (retrained(0.15, 0.3), FAST, RECOVERABLE),
-        (retrained(0.21, 0.3), FAST, RECOVERABLE),
+        (never_lived(0.15, 0.3), SLOW, CONSISTENT),
+        (never_lived(0.0, 0.1), SLOW, CONSISTENT),  # they touch
+        (never_lived(0.15, 0.3), {"unlearned": 50_000, "control": 100_000}, CONSISTENT),  # half is not less than half
+        (never_lived(0.21, 0.3), SLOW, INCONCLUSIVE),
+        (never_lived(0.0, 0.09), SLOW, INCONCLUSIVE),
+        (never_lived(0.15, 0.3), FAST, RECOVERABLE),
+        (never_lived(0.21, 0.3), FAST, RECOVERABLE),
         (None, FAST, RECOVERABLE),
-        (None, {"unlearned": 40_000, "retrained": None}, RECOVERABLE),
-        (retrained(0.15, 0.3), {"unlearned": None, "retrained": 100_000}, INCONCLUSIVE),
-        (retrained(0.15, 0.3), {"unlearned": None, "retrained": None}, INCONCLUSIVE),
+        (None, {"unlearned": 40_000, "control": None}, RECOVERABLE),
+        (never_lived(0.15, 0.3), {"unlearned": None, "control": 100_000}, INCONCLUSIVE),
+        (never_lived(0.15, 0.3), {"unlearned": None, "control": None}, INCONCLUSIVE),
     ],
 )
-def test_with_a_retrained_policy_and_relearning(control, relearning, word):
-    assert judge(policies(), retrained=control, relearning=relearning).word == word
+def test_with_a_control_and_relearning(control, relearning, word):
+    assert judge(policies(), control=control, relearning=relearning).word == word
 
 
 def test_a_failure_stays_one_whatever_the_comparisons_say():
-    verdict = judge(policies(interval(0.5, 0.9)), retrained=retrained(0.1, 0.2), relearning=FAST)
+    verdict = judge(policies(interval(0.5, 0.9)), control=never_lived(0.1, 0.2), relearning=FAST)
     assert verdict.word == FAILED
 
 
 def test_transitions_are_told_with_the_verdict():
-    told = judge(policies(), relearning={"unlearned": 40_000, "retrained": None}).reasons[-1]
+    told = judge(policies(), relearning={"unlearned": 40_000, "control": None}).reasons[-1]
     assert told == (
-        "It comes back sooner than it can be learned: unlearned after 40,000, retrained never target transitions."
+        "It comes back sooner than it can be learned: unlearned after 40,000, control never target transitions."
     )
 
 
