@@ -257,9 +257,9 @@ def percent(value: Estimate | None, digits: int = 0, interval: bool = True) -> s
 def _cell(value: Estimate | None, interval: bool, digits: int, *, scale: float, unit: str) -> str:
     if value is None or "mean" not in value:
         return ""
-    text = f"{scale * value['mean']:z.{digits}f}{unit}"
+    text = f"{scale * value['mean']:z,.{digits}f}{unit}"
     if interval and "low" in value:
-        text += f" [{scale * value['low']:z.{digits}f}, {scale * value['high']:z.{digits}f}]"
+        text += f" [{scale * value['low']:z,.{digits}f}, {scale * value['high']:z.{digits}f}]"
     return text
 
 
