@@ -259,7 +259,7 @@ def _cell(value: Estimate | None, interval: bool, digits: int, *, scale: float, 
         return ""
     text = f"{scale * value['mean']:z,.{digits}f}{unit}"
     if interval and "low" in value:
-        text += f" [{scale * value['low']:z,.{digits}f}, {scale * value['high']:z.{digits}f}]"
+        text += f" [{scale * value['low']:z,.{digits}f}, {scale * value['high']:z,.{digits}f}]"
     return text
 
 
