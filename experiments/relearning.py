@@ -38,8 +38,8 @@ def measure(lab: Lab) -> dict[str, Any]:
     folders = lab.run(starts, "policies to relearn from")
     base = _on_targets(json.loads(next(iter(folders.values())).joinpath("evaluation.json").read_text()), lab.targets)
     every = max(1, lab.iterations // EVALUATIONS)
-    # A start's own settings would be its training's: all of them relearn at the same fixed pace and held by nothing. On a
-    # laptop the targets have as many of the starts as in unlearning: whoever wants them back would do the same.
+    # A start's own settings would be its training's: all of them relearn at the same fixed pace and held by nothing. On
+    # a laptop the targets have as many of the starts as in unlearning: whoever wants them back would do the same.
     on_laptop = lab.options.budget == "cpu"
     pace = {**PACE, "schedule": "fixed", "anchor": 0.0} if on_laptop else {}
     alike = [f"ppo.{name}={json.dumps(value)}" for name, value in pace.items()]
