@@ -7,7 +7,6 @@ and is open between. With one seed there is no interval, and the word is only wh
 
 from __future__ import annotations
 
-import itertools
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -20,6 +19,7 @@ import numpy as np
 from experiments import comparison, membership, relearning
 from forgetmimic_jax.errors import InputError, run_command
 from forgetmimic_jax.evaluation import statistics
+from forgetmimic_jax.evaluation.relearning import crossings
 from forgetmimic_jax.evaluation.statistics import Estimate
 from forgetmimic_jax.evaluation.tables import FORGOTTEN, markdown_table, number, percent
 from forgetmimic_jax.evaluation.variants import within
@@ -34,6 +34,7 @@ SUCCESS, TRACKING = "success_rate", "survival_weighted_tracking"
 NONE = 0.05  # of episodes: a success rate below it counts as none
 POINTS = 0.05  # of success that kept clips may lose
 SOONER = 1.0  # steps by which an episode may end before doing nothing would end it
+CONTROL = "distilled"  # never lived a target, and is made in minutes: what relearning is compared with
 ARFT, UNIFORM = "arft", "arft, uniform clips"
 
 
@@ -156,21 +157,27 @@ def of_physical_behaviour(document: Mapping[str, Any]) -> Iterator[Finding]:
 
 def of_relearning(document: Mapping[str, Any]) -> Iterator[Finding]:
     """Fig. 8, with the controls that the paper lacks."""
-    base, starts = document["results"]["base"], document["results"]["starts"]
-    controls = [label for label in ("distilled", "retrained") if {"unlearned", label} <= starts.keys()]
-    for control, share in itertools.product(controls, relearning.SHARES):
-        mine, theirs = (
-            [found[1] for curve in starts[label].values() if (found := relearning.crossing(curve, share * base))]
-            for label in ("unlearned", control)
-        )
-        claim = f"{share:.0%} of the tracking comes back no sooner than it comes to a {control} policy"
-        if not mine or not theirs:
-            never = " and ".join(label for label, of in (("unlearned", mine), (control, theirs)) if not of)
-            yield Finding(claim, "open" if not mine else "does not hold", f"not reached within the run: {never}")
-            continue
-        found_mine, mean = statistics.over_seeds(mine), float(np.mean(theirs))
-        evidence = f"{number(found_mine, 0)} target steps from the unlearned policy, {mean:,.0f} from the {control}"
-        yield Finding(claim, judged(found_mine, mean, below=False), evidence)
+    results = document["results"]
+    if not {"unlearned", CONTROL} <= results["starts"].keys():
+        return
+    for share in relearning.SHARES:
+        claim = f"{share:.0%} of the tracking comes back no sooner than it comes to a {CONTROL} policy"
+        reached = {label: crossings(results, label, share) for label in ("unlearned", CONTROL)}
+        lasted = {
+            label: [pair[1] if pair else curve["target_steps"][-1] for pair, curve in
+                    zip(of, results["starts"][label].values(), strict=True)]
+            for label, of in reached.items()
+        }  # fmt: skip
+        mine, theirs = statistics.over_seeds(lasted["unlearned"]), float(np.mean(lasted[CONTROL]))
+        never = {label: of.count(None) for label, of in reached.items()}
+        verdict = "open" if never["unlearned"] else judged(mine, theirs, below=False)
+        if never[CONTROL] and verdict in ("holds", "one seed: yes"):
+            verdict = "open"  # the control's mean is a lower bound
+        evidence = f"{number(mine, 0)} target steps from the unlearned policy, {theirs:,.0f} from the {CONTROL}"
+        ends = [f"{label} in {count} of {len(reached[label])} runs" for label, count in never.items() if count]
+        if ends:
+            evidence += f"; not reached, counted with the run's end: {' and '.join(ends)}"
+        yield Finding(claim, verdict, evidence)
 
 
 def of_membership(document: Mapping[str, Any]) -> Iterator[Finding]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +10,7 @@ import numpy as np
 from forgetmimic_jax.evaluation.plots import curve, heat_map, new_figure
 from forgetmimic_jax.evaluation.tables import markdown_table, number
 from forgetmimic_jax.evaluation.variants import over_seeds
+from forgetmimic_jax.evaluation.watch import SHOWN
 from forgetmimic_jax.rows import read_rows
 from forgetmimic_jax.study import Lab, Study, main
 
@@ -18,20 +18,16 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CHECKPOINTS = 21  # after the base
-SHOWN = ("tracking_reward", "survival_weighted_tracking", "success_rate")
 
 
 def measure(lab: Lab) -> dict[str, Any]:
     """Each seed's run, evaluated 21 times on its way."""
-    every = max(1, lab.iterations // CHECKPOINTS)
-    asked = {seed: {"seed": seed, "set": [f"evaluate_every={every}"]} for seed in lab.seeds}
+    asked = {seed: {"seed": seed, "set": lab.watched(CHECKPOINTS)} for seed in lab.seeds}
     columns: list[list[Any]] = []
     groups: list[list[Any]] = []
-    for folder in lab.run(asked, "heat map").values():
-        base = json.loads((folder / "evaluation.json").read_text())["policies"]["base"]["clips"]
-        start = {clip: {metric: base[clip][metric]["mean"] for metric in SHOWN} for clip in base}
+    for seed, folder in lab.run(asked, "heat map").items():
         rows = read_rows(folder / "evaluations.jsonl")
-        columns.append([start, *({c: {m: row["clips"][c][m] for m in SHOWN} for c in base} for row in rows)])
+        columns.append([lab.as_watched({"base": lab.base}, seed)["base"], *(row["clips"] for row in rows)])
         groups.append([group_means(clips, lab.targets) for clips in columns[-1]])
         iterations = [0, *(row["iteration"] for row in rows)]
     checkpoints, means = ([over_seeds(at) for at in zip(*of, strict=True)] for of in (columns, groups))

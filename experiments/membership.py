@@ -77,8 +77,9 @@ def tell(document: Mapping[str, Any]) -> str:
     rows += [[f"*paper: {label}*", "", f"{value:.2f}", "", "", ""] for label, value in paper.MEMBERSHIP.items()]
     note = (
         "Members are the targets, the others their mirror images, which no policy was trained on; the attacker learned "
-        "from the kept clips and their images. Guessing is 0.5, 0.5 and 0.05. Intervals are over policies. This is "
-        "probe evidence: it certifies nothing. The paper's attack is another, on another library.\n"
+        "from the kept clips and their images. Guessing is 0.5, 0.5 and 0.05. Intervals are over policies. The "
+        f"retrained one has had {document['asked']['control_iterations']:,} iterations. This is probe evidence: it "
+        "certifies nothing. The paper's attack is another, on another library.\n"
     )
     return f"{markdown_table(['', 'policies', *NAMES.values(), 'verdict'], rows)}\n{note}"
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from forgetmimic_jax.evaluation import paper, statistics
 from forgetmimic_jax.evaluation.plots import new_figure
+from forgetmimic_jax.evaluation.relearning import crossings
 from forgetmimic_jax.evaluation.tables import markdown_table, number
 from forgetmimic_jax.rows import read_rows
 from forgetmimic_jax.study import Lab, Study, main, newest_policy
@@ -31,52 +32,62 @@ SHARES = (0.5, 0.8, 0.95)  # of the base's survival-weighted tracking on the tar
 def measure(lab: Lab) -> dict[str, Any]:
     """First the policies to start from, then their relearning."""
     given = {"iterations": ITERATIONS[lab.options.budget]}
-    starts: dict[tuple[str, int], dict[str, Any]] = {("unlearned", seed): {**given, "seed": seed} for seed in lab.seeds}
-    starts |= {("distilled", seed): {**given, "method": "distill", "seed": seed} for seed in lab.seeds}
+    asked: dict[tuple[str, int], dict[str, Any]] = {("unlearned", seed): {**given, "seed": seed} for seed in lab.seeds}
+    asked |= {("distilled", seed): {**given, "method": "distill", "seed": seed} for seed in lab.seeds}
     retrain = {"method": "retrain", "iterations": lab.control_iterations}
-    starts |= {("retrained", seed): {**retrain, "seed": seed} for seed in lab.control_seeds}
-    folders = lab.run(starts, "policies to relearn from")
-    base = _on_targets(json.loads(next(iter(folders.values())).joinpath("evaluation.json").read_text()), lab.targets)
-    every = max(1, lab.iterations // EVALUATIONS)
+    asked |= {("retrained", seed): {**retrain, "seed": seed} for seed in lab.control_seeds}
+    policies = {key: newest_policy(folder) for key, folder in lab.run(asked, "policies to relearn from").items()}
     # A start's own settings would be its training's: all of them relearn at the same fixed pace and held by nothing. On
     # a laptop the targets have as many of the starts as in unlearning: whoever wants them back would do the same.
     on_laptop = lab.options.budget == "cpu"
     pace = {**PACE, "schedule": "fixed", "anchor": 0.0} if on_laptop else {}
     alike = [f"ppo.{name}={json.dumps(value)}" for name, value in pace.items()]
     alike += ["wrench.max_gain=0.0", f"sampling.target_share={TARGET_SHARE if on_laptop else 0.0}"]
-    measured = [f"evaluate_every={every}", f"evaluate_episodes={max(1, lab.options.episodes // 2)}"]
-    watched = {"clips": "all", "set": [*measured, *alike]}
+    watched = {"clips": "all", "set": [*lab.watched(EVALUATIONS), *alike]}
     relearn: dict[tuple[str, int], dict[str, Any]] = {
-        (label, seed): {**watched, "method": "finetune", "base": newest_policy(folder), "seed": seed}
-        for (label, seed), folder in folders.items()
+        (label, seed): {**watched, "method": "finetune", "base": policy, "seed": seed}
+        for (label, seed), policy in policies.items()
     }
     relearn |= {
         ("fresh", seed): {**watched, "method": "retrain", "sampler": "uniform_clips", "seed": seed}
         for seed in lab.seeds
     }
-    curves: dict[str, Any] = {}
-    for (label, seed), folder in lab.run(relearn, "relearning").items():
-        curves.setdefault(label, {})[str(seed)] = curve_of(folder, lab.targets, from_scratch=label == "fresh")
+    relearned = lab.run(relearn, "relearning")
+    base: dict[str, float] = {}
+    curves: dict[str, Any] = {label: {} for label, _ in relearned}
+    for seed in lab.seeds:
+        starts = {label: policy for (label, of), policy in policies.items() if of == seed}
+        at_first = lab.as_watched({"base": lab.base, **starts}, seed)
+        base[str(seed)] = _tracking(at_first["base"], lab.targets)
+        for (label, of), folder in relearned.items():
+            if of == seed:
+                curves[label][str(seed)] = curve_of(folder, lab.targets, at_first.get(label))
     return {"base": base, "starts": curves}
 
 
-def _on_targets(document: Mapping[str, Any], targets: tuple[str, ...]) -> float:
-    """Survival-weighted tracking of the policy that a run started from, mean of the targets."""
-    clips = document["policies"]["base"]["clips"]
-    return float(np.mean([clips[target]["survival_weighted_tracking"]["mean"] for target in targets]))
+def _tracking(clips: Mapping[str, Mapping[str, float]], targets: tuple[str, ...]) -> float:
+    """Survival-weighted tracking, mean of the targets."""
+    return float(np.mean([clips[target]["survival_weighted_tracking"] for target in targets]))
 
 
-def curve_of(folder: Path, targets: tuple[str, ...], *, from_scratch: bool) -> dict[str, list[float]]:
-    """Tracking on the targets, and the target steps lived until then, at every evaluation of a relearning run."""
+def curve_of(
+    folder: Path, targets: tuple[str, ...], at_first: Mapping[str, Mapping[str, float]] | None
+) -> dict[str, list[float]]:
+    """Tracking on the targets, and the target steps lived until then, at every evaluation of a relearning run.
+
+    Args:
+        folder: of the run.
+        targets: clips.
+        at_first: the policy that the run started from, clip by clip, on the same episodes; None for a fresh one.
+    """
     rows, log = (read_rows(folder / name) for name in ("evaluations.jsonl", "metrics.jsonl"))
     lived = np.diff([0, *(row["environment_steps"] for row in log)]) * [row["target/step_share"] for row in log]
     until = {row["iteration"]: steps for row, steps in zip(log, np.cumsum(lived), strict=True)}
-    document = json.loads((folder / "evaluation.json").read_text())
-    start = [] if from_scratch else [(0, _on_targets(document, targets), 0.0)]
+    start = [] if at_first is None else [(0, _tracking(at_first, targets), 0.0)]
     points = [
         (
             row["iteration"],
-            float(np.mean([row["clips"][target]["survival_weighted_tracking"] for target in targets])),
+            _tracking(row["clips"], targets),
             float(max((steps for iteration, steps in until.items() if iteration <= row["iteration"]), default=0.0)),
         )
         for row in rows
@@ -85,22 +96,13 @@ def curve_of(folder: Path, targets: tuple[str, ...], *, from_scratch: bool) -> d
     return {"iterations": list(iterations), "tracking": list(tracking), "target_steps": list(steps)}
 
 
-def crossing(curve: Mapping[str, list[float]], level: float) -> tuple[float, float] | None:
-    """Iterations and target steps at the first of two evaluations in a row that are not below `level`."""
-    above = [tracking >= level for tracking in curve["tracking"]]
-    for iteration, steps, now, then in zip(curve["iterations"], curve["target_steps"], above, above[1:], strict=False):
-        if now and then:
-            return iteration, steps
-    return None
-
-
 def tell(document: Mapping[str, Any]) -> str:
     """Iterations and target steps until each share of the base, over the seeds that got there."""
-    base, starts = document["results"]["base"], document["results"]["starts"]
+    results = document["results"]
     rows = []
-    for label, runs in starts.items():
+    for label, runs in results["starts"].items():
         for share in SHARES:
-            found = [crossing(curve, share * base) for curve in runs.values()]
+            found = crossings(results, label, share)
             reached = sum(pair is not None for pair in found)
             ends = [(curve["iterations"][-1], curve["target_steps"][-1]) for curve in runs.values()]
             lasted = [pair or end for pair, end in zip(found, ends, strict=True)]
@@ -111,10 +113,12 @@ def tell(document: Mapping[str, Any]) -> str:
             rows.append([label, f"{100 * share:.0f} %", f"{reached} of {len(found)}", *cells])
     theirs = ", ".join(f"{iterations:,} for {clips}" for clips, iterations in paper.RELEARNING.items())
     note = (
-        f"Shares of the base's survival-weighted tracking on the targets, {base:.3f}, reached at the first of two "
-        "evaluations in a row that are not below; more than: a run that never got there counts with its end. The paper "
-        f"(another library and budget) took {theirs} until 95 % of its tracking while alive, from its unlearned "
-        "policy; it has no control.\n"
+        f"Shares of the base's survival-weighted tracking on the targets, "
+        f"{number(statistics.over_seeds(list(results['base'].values())))}, on the same episodes, reached at the first "
+        "of two evaluations in a row that are not below; more than: a run that never got there counts with its end. "
+        f"The retrained policy has had {document['asked']['control_iterations']:,} iterations: as little as that is a "
+        f"reference for the first steps only. The paper (another library and budget) took {theirs} until 95 % of its "
+        "tracking while alive, from its unlearned policy; it has no control.\n"
     )
     header = ["start", "share of the base", "runs that reached it", "iterations", "target steps"]
     return f"{markdown_table(header, rows)}\n{note}"
@@ -122,7 +126,7 @@ def tell(document: Mapping[str, Any]) -> str:
 
 def draw(document: Mapping[str, Any]) -> Figure:
     """Tracking on the targets over iterations and over target steps."""
-    base = document["results"]["base"]
+    base = float(np.mean(list(document["results"]["base"].values())))
     figure = new_figure(width=10.0, height=4.0)
     for place, x in enumerate(("iterations", "target_steps")):
         axes = figure.add_subplot(1, 2, place + 1)

@@ -193,19 +193,17 @@ def _control(run: Path, document: Mapping[str, Any]) -> dict[str, Any]:
 
 def _relearning(path: Path, document: Mapping[str, Any]) -> dict[str, float | None]:
     """Target transitions until 80 % of the base's tracking, mean over the seeds; None where a seed never got there."""
+    from forgetmimic_jax.evaluation.relearning import crossings
+
     try:
         study = json.loads(path.read_text())
         asked, results = study["asked"], study["results"]
-        found = {}
         control = "distilled" if "distilled" in results["starts"] else "retrained"
+        found = {}
         for who, start in (("unlearned", "unlearned"), ("control", control)):
-            until = [
-                next((steps for tracking, steps in zip(curve["tracking"], curve["target_steps"], strict=True)
-                      if tracking >= RELEARNED * results["base"]), None)
-                for curve in results["starts"][start].values()
-            ]  # fmt: skip
-            reached = [steps for steps in until if steps is not None]
-            found[who] = sum(reached) / len(reached) if reached and len(reached) == len(until) else None
+            reached = crossings(results, start, RELEARNED)
+            steps = [pair[1] for pair in reached if pair]
+            found[who] = sum(steps) / len(steps) if steps and len(steps) == len(reached) else None
     except FileNotFoundError:
         raise InputError(f"{path}: not found") from None
     except (ValueError, KeyError, TypeError, AttributeError) as error:

@@ -235,14 +235,36 @@ class Lab:
                 }
         return {"variants": result}
 
+    def watched(self, times: int) -> list[str]:
+        """Settings of a trial that is evaluated so often on its way, on half of the study's episodes."""
+        return [f"evaluate_every={max(1, self.iterations // times)}", f"evaluate_episodes={self._watched_episodes}"]
+
+    def as_watched(self, policies: Mapping[K, Path], seed: int) -> dict[K, dict[str, dict[str, float]]]:
+        """Policies, clip by clip, on the episodes on which a watched trial of this seed is evaluated."""
+        from forgetmimic_jax.evaluation.watch import clip_means
+
+        rolled, names = self.rollouts(policies, episodes=self._watched_episodes, seed=seed)
+        return {key: clip_means(rollout, names) for key, rollout in rolled.items()}
+
+    @property
+    def _watched_episodes(self) -> int:
+        return max(1, self.options.episodes // 2)
+
     def rollouts(
-        self, policies: Mapping[K, Path | None], clips: Sequence[Clip] | None = None
+        self,
+        policies: Mapping[K, Path | None],
+        clips: Sequence[Clip] | None = None,
+        *,
+        episodes: int | None = None,
+        seed: int = 0,
     ) -> tuple[dict[K, Rollout], tuple[str, ...]]:
         """Every policy on the same episodes, and the clips' names.
 
         Args:
             policies: checkpoints by any key; None is the zero action.
             clips: other clips than the library's.
+            episodes: a clip; the study's by default.
+            seed: of the episodes.
         """
         from forgetmimic_jax import checkpoint, runner
         from forgetmimic_jax.evaluation.rollout import Evaluator
@@ -251,7 +273,7 @@ class Lab:
 
         setup = runner.make_setup(on_engine(self.config, self.options.physics))
         library = setup.library if clips is None else build_library(setup.robot, clips)
-        evaluator = Evaluator(setup.config, setup.robot, library, episodes=self.options.episodes, seed=0)
+        evaluator = Evaluator(setup.config, setup.robot, library, episodes=episodes or self.options.episodes, seed=seed)
         shapes = runner.template(setup)
         rolled = {}
         with progress("roll out", len(policies)) as report:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from forgetmimic_jax.config import Config
-from forgetmimic_jax.evaluation.metrics import episode_metrics
+from forgetmimic_jax.evaluation.metrics import Rollout, episode_metrics
 from forgetmimic_jax.evaluation.plots import clips_over_time
 from forgetmimic_jax.evaluation.rollout import Evaluator
 from forgetmimic_jax.motion.library import MotionLibrary
@@ -17,6 +18,15 @@ from forgetmimic_jax.state import Policy
 
 FILE = "evaluations.jsonl"
 SHOWN = ("success_rate", "survival_weighted_tracking", "tracking_reward")
+
+
+def clip_means(rollout: Rollout, names: Sequence[str]) -> dict[str, dict[str, float]]:
+    """What a row says of every clip."""
+    metrics = episode_metrics(rollout)
+    return {
+        clip: {name: round(float(metrics[name][rollout.clip == i].mean()), 4) for name in SHOWN}
+        for i, clip in enumerate(names)
+    }
 
 
 class Watch:
@@ -35,10 +45,7 @@ class Watch:
         metrics = episode_metrics(rollout)
         row: dict[str, Any] = {"iteration": iteration, "environment_steps": environment_steps}
         row |= {name: float(metrics[name].mean()) for name in SHOWN}
-        row["clips"] = {
-            clip: {name: round(float(metrics[name][rollout.clip == i].mean()), 4) for name in SHOWN}
-            for i, clip in enumerate(self._names)
-        }
+        row["clips"] = clip_means(rollout, self._names)
         with self._path.open("a") as file:
             file.write(json.dumps(row) + "\n")
         clips_over_time(self._path, self._path.with_suffix(".png"))

@@ -153,12 +153,13 @@ def test_comparisons_enter_the_verdict(run, tmp_path):
     asked = {"library": document["library_hash"], "targets": document["targets"]}
 
     def curve(steps: int) -> dict:
-        return {"tracking": [0.1, 0.39, 0.4, 0.2], "target_steps": [0, steps / 2, steps, 2 * steps]}
+        reached = {"iterations": [0, 1, 2, 3], "target_steps": [0, steps / 2, steps, 2 * steps]}
+        return reached | {"tracking": [0.1, 0.39, 0.4, 0.5]}
 
     def word(unlearned: int) -> str:
         # The base tracks at 0.5, so 0.4 is relearned; the retrained policy is there after 1000 steps on the targets.
         starts = {"unlearned": {"0": curve(unlearned), "1": curve(unlearned)}, "retrained": {"0": curve(1000)}}
-        counts.write_text(json.dumps({"asked": asked, "results": {"base": 0.5, "starts": starts}}))
+        counts.write_text(json.dumps({"asked": asked, "results": {"base": {"0": 0.5, "1": 0.5}, "starts": starts}}))
         options = report.Options(run=copy, control=control, relearning=counts, films=0, output=tmp_path / "r.html")
         printed = finished(report.main, options).printed
         facts = json.loads((tmp_path / "r.json").read_text())
@@ -279,21 +280,24 @@ def test_comparisons_that_do_not_fit_are_told(refused, run, tmp_path):
     assert told_of_counts("[]").startswith("no relearning study: TypeError: ")
     asked = {"library": document["library_hash"], "targets": document["targets"]}
     starts = {"unlearned": {}, "retrained": {}}
-    results = {"base": 0.5, "starts": starts}
-    only = {"asked": asked, "results": {"base": 0.5, "starts": {"unlearned": {}}}}
+    results = {"base": {}, "starts": starts}
+    only = {"asked": asked, "results": {"base": {}, "starts": {"unlearned": {}}}}
     assert told_of_counts(json.dumps(only)) == "no relearning study: KeyError: 'retrained'"
     other_targets = {"asked": asked | {"targets": ["nod"]}, "results": results}
     assert told_of_counts(json.dumps(other_targets)) == "targets: found ['nod']; the unlearned run's is ['turn']"
 
 
 def test_a_seed_that_never_relearned_makes_it_never(run, tmp_path):
-    curves = {"0": {"tracking": [0.5], "target_steps": [10.0]}, "1": {"tracking": [0.3], "target_steps": [10.0]}}
+    def curve(tracking: float, steps: float) -> dict:
+        return {"tracking": [tracking] * 2, "target_steps": [steps, 99.0], "iterations": [1, 2]}
+
+    curves = {"0": curve(0.5, 10.0), "1": curve(0.3, 10.0)}
     document = json.loads((run / "evaluation.json").read_text())
     asked = {"library": document["library_hash"], "targets": document["targets"]}
-    results = {"base": 0.5, "starts": {"unlearned": curves, "retrained": {"0": curves["0"]}}}
+    results = {"base": {"0": 0.5, "1": 0.5}, "starts": {"unlearned": curves, "retrained": {"0": curves["0"]}}}
     path = tmp_path / "relearning.json"
     path.write_text(json.dumps({"asked": asked, "results": results}))
     assert report._relearning(path, document) == {"unlearned": None, "control": 10.0}
-    results["starts"]["distilled"] = {"0": {"tracking": [0.5], "target_steps": [7.0]}}  # as able as the base, so fairer
+    results["starts"]["distilled"] = {"0": curve(0.5, 7.0)}  # as able as the base, so fairer
     path.write_text(json.dumps({"asked": asked, "results": results}))
     assert report._relearning(path, document)["control"] == 7.0

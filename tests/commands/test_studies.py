@@ -327,15 +327,6 @@ def test_the_comparison_asks_for_every_method_and_every_sampler_with_and_without
     assert {key[5] for key in asked_for if key[0] != "retrain"} == {0, 1}
 
 
-def test_a_level_is_reached_at_the_first_of_two_evaluations_in_a_row():
-    crossing = importlib.import_module("experiments.relearning").crossing
-    curve = {"iterations": [0, 10, 20, 30, 40], "target_steps": [0.0, 5.0, 9.0, 14.0, 20.0]}
-    curve["tracking"] = [0.1, 0.6, 0.4, 0.5, 0.7]
-    assert crossing(curve, 0.5) == (30, 14.0)
-    assert crossing(curve, 0.1) == (0, 0.0)
-    assert crossing(curve, 0.6) is None  # the last evaluation stands alone
-
-
 def test_the_penalty_where_half_of_the_skill_is_gone_lies_between_two_that_were_tried():
     assert sweep.half_gone({16.0: 0.1, 4.0: 0.9, 8.0: 0.7}) == pytest.approx(8.0 * 2.0 ** (0.2 / 0.6))
     assert sweep.half_gone({4.0: 0.9, 16.0: 0.6}) is None

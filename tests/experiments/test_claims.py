@@ -83,13 +83,21 @@ def test_what_comes_back_sooner_than_it_is_learned_was_not_forgotten():
         tracking = [0.9 if step >= at else 0.1 for step in range(6)]
         return {"iterations": list(range(6)), "target_steps": [100.0 * step for step in range(6)], "tracking": tracking}
 
-    starts = {"unlearned": {str(seed): curve(1 + seed % 2) for seed in range(3)}, "retrained": {"0": curve(4)}}
-    found = [of.verdict for of in claims.of_relearning({"results": {"base": 0.9, "starts": starts}})]
-    assert found == ["does not hold"] * 3
-    starts["retrained"]["0"] = curve(9)
-    found = list(claims.of_relearning({"results": {"base": 0.9, "starts": starts}}))
-    assert {of.verdict for of in found} == {"does not hold"}
-    assert "not reached within the run: retrained" in found[0].evidence
+    def found(unlearned: list[int], distilled: int) -> claims.Finding:
+        mine = {str(seed): curve(at) for seed, at in enumerate(unlearned)}
+        starts = {"unlearned": mine, "distilled": {"0": curve(distilled)}}
+        every = list(claims.of_relearning({"results": {"base": dict.fromkeys("012", 0.9), "starts": starts}}))
+        assert len({of.verdict for of in every}) == 1
+        return every[0]
+
+    assert found([1, 2, 1], 4).verdict == "does not hold"
+    assert found([3, 4, 3], 1).verdict == "holds"
+    never = found([1, 2, 1], 9)
+    assert never.verdict == "does not hold"  # later than its run's end, which is late enough
+    assert never.evidence.endswith("not reached, counted with the run's end: distilled in 1 of 1 runs")
+    assert found([1, 9, 1], 9).verdict == "open"
+    assert found([4], 9).verdict == "one seed: no"
+    assert found([9], 9).verdict == "open"
 
 
 def test_the_table_names_what_is_not_measured(tmp_path):
