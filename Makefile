@@ -3,7 +3,7 @@
 
 # Variables: `make TARGET VARIABLE=value`. A command gets those that are set and keeps its own default for the others.
 ## ROBOT        a folder under robots/ (default: g1)
-## TARGETS      clips to forget, comma-separated: punch,kick
+## TARGETS      clips to forget, comma-separated (default: the robot's; g1: punch,kick)
 ## LAMBDA       penalty on the targets' tracking reward (default: 16)
 ## METHOD       how to forget; `make unlearn ARGS=--help` names them (default: arft)
 ## PRESET       cpu or paper (default: cpu)
@@ -12,11 +12,11 @@
 ## ITERATIONS   training iterations
 ## SEED         random seed
 ## BASE         the policy to start from (default: the shipped one; for pretrain, none)
-## CHECKPOINT   the policy to evaluate, export, play or film
+## CHECKPOINT   the policy to evaluate, export, play or film (default: the shipped base)
 ## CLIPS        clips to film, comma-separated (default: all)
-## EPISODES     episodes a clip in an evaluation (default: 20)
+## EPISODES     episodes a clip in an evaluation (default: 20; export: 2)
 ## RUN          folder of the run to report on
-## OUTPUT       folder for the results (default: a folder under runs/)
+## OUTPUT       folder for the results, for export and report the file (default: under runs/)
 ## RESUME       1 goes on with the run in OUTPUT
 ## SWEEP        lambda, targets, sampler or seeds (default: lambda)
 ## ARGS         any other flags, as they are; ARGS=--help lists them

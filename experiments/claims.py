@@ -45,6 +45,7 @@ class Finding:
     claim: str
     verdict: str
     evidence: str
+    seeds: int
 
 
 def judged(value: Estimate, bound: float, *, below: bool = True) -> str:
@@ -79,10 +80,10 @@ def of_validity(document: Mapping[str, Any]) -> Iterator[Finding]:
         success, skill = target[SUCCESS], target.get("skill")
         claim = f"{label}: the targets no longer succeed"
         evidence = f"target success {percent(within(success, 0.0, 1.0))}; at most {NONE:.0%} asked"
-        yield Finding(claim, judged(success, NONE), evidence)
+        yield Finding(claim, judged(success, NONE), evidence, success["n"])
         if skill:
             evidence = f"{percent(skill)} of the skill above the zero action is left; at most {FORGOTTEN:.0%} asked"
-            yield Finding(f"{label}: the skill is gone", judged(skill, FORGOTTEN), evidence)
+            yield Finding(f"{label}: the skill is gone", judged(skill, FORGOTTEN), evidence, skill["n"])
         yield from _kept(variants, label, None, f"{label}: the kept clips stay as they were")
 
 
@@ -95,18 +96,19 @@ def of_comparison(document: Mapping[str, Any]) -> Iterator[Finding]:
         kept = gained(variants, method, ARFT, "kept", TRACKING)
         if kept:
             evidence = f"kept tracking {number(kept, 2)} on λ = 16's"
-            yield Finding(f"{method} hurts the kept clips more", judged(kept, 0.0), evidence)
+            yield Finding(f"{method} hurts the kept clips more", judged(kept, 0.0), evidence, kept["n"])
     for method in ("random reward", "trajdeleter"):
         target = gained(variants, method, ARFT, "target", TRACKING)
         if target:
             evidence = f"target tracking {number(target, 2)} on λ = 16's"
-            yield Finding(f"{method} forgets less", judged(target, 0.0, below=False), evidence)
+            yield Finding(f"{method} forgets less", judged(target, 0.0, below=False), evidence, target["n"])
     for label, name in (("arft, adaptive", "adaptive RSI"), ("arft, uniform clips, wrench", "the wrench")):
         for group, claim in (("target", f"{name} resists forgetting"), ("kept", f"{name} costs the kept clips")):
             change = gained(variants, label, UNIFORM, group, TRACKING)
             if change:
                 verdict = judged(change, 0.0, below=group == "kept")
-                yield Finding(claim, verdict, f"{group} tracking {number(change, 2)} on that of {UNIFORM}")
+                evidence = f"{group} tracking {number(change, 2)} on that of {UNIFORM}"
+                yield Finding(claim, verdict, evidence, change["n"])
 
 
 def of_penalty(document: Mapping[str, Any]) -> Iterator[Finding]:
@@ -117,7 +119,7 @@ def of_penalty(document: Mapping[str, Any]) -> Iterator[Finding]:
         found = statistics.over_seeds(crossed)
         crit = next(iter(variants.values()))["over_seeds"].get("lambda_crit")
         evidence = f"half of the skill is gone at λ = {number(found, 1)}; λ_crit on the base's steps {number(crit, 2)}"
-        yield Finding("forgetting sets in below λ = 8 = W", judged(found, 8.0), evidence)
+        yield Finding("forgetting sets in below λ = 8 = W", judged(found, 8.0), evidence, found["n"])
 
 
 def of_heat_map(document: Mapping[str, Any]) -> Iterator[Finding]:
@@ -125,9 +127,8 @@ def of_heat_map(document: Mapping[str, Any]) -> Iterator[Finding]:
     groups, bound = document["results"]["groups"], 0.95
     start, end = groups[0]["kept"][TRACKING], groups[-1]["kept"][TRACKING]
     evidence = f"kept tracking {number(start, 2)} at the start, {number(end, 2)} at the end; {bound:.0%} of it asked"
-    yield Finding(
-        "a long run does not wear the kept clips down", judged(end, bound * start["mean"], below=False), evidence
-    )
+    verdict = judged(end, bound * start["mean"], below=False)
+    yield Finding("a long run does not wear the kept clips down", verdict, evidence, end["n"])
 
 
 def of_motion_types(document: Mapping[str, Any]) -> Iterator[Finding]:
@@ -137,7 +138,7 @@ def of_motion_types(document: Mapping[str, Any]) -> Iterator[Finding]:
         if skill:
             evidence = f"{percent(skill)} of the skill is left"
             claim = f"{label} can be forgotten on the {document['asked']['robot'].upper()}"
-            yield Finding(claim, judged(skill, FORGOTTEN), evidence)
+            yield Finding(claim, judged(skill, FORGOTTEN), evidence, skill["n"])
 
 
 def of_physical_behaviour(document: Mapping[str, Any]) -> Iterator[Finding]:
@@ -152,7 +153,7 @@ def of_physical_behaviour(document: Mapping[str, Any]) -> Iterator[Finding]:
             claim = f"{label}: short episodes mean a lost skill, and not an episode ended on purpose"
             short = found["mean"] < 0.5 * (base + floor)
             verdict = judged(found, floor - SOONER, below=False) if short else "not short"
-            yield Finding(claim, verdict, f"target episodes last {steps}")
+            yield Finding(claim, verdict, f"target episodes last {steps}", found["n"])
 
 
 def of_relearning(document: Mapping[str, Any]) -> Iterator[Finding]:
@@ -177,14 +178,15 @@ def of_relearning(document: Mapping[str, Any]) -> Iterator[Finding]:
         ends = [f"{label} in {count} of {len(reached[label])} runs" for label, count in never.items() if count]
         if ends:
             evidence += f"; not reached, counted with the run's end: {' and '.join(ends)}"
-        yield Finding(claim, verdict, evidence)
+        yield Finding(claim, verdict, evidence, mine["n"])
 
 
 def of_membership(document: Mapping[str, Any]) -> Iterator[Finding]:
     """Appendix: the attack."""
     for label, of in document["results"]["policies"].items():
         claim = f"{label}: membership of the targets cannot be told"
-        yield Finding(claim, membership.verdict(of["auc"]), f"AUC {number(of['auc'], 2)}; 0.5 is guessing")
+        evidence = f"AUC {number(of['auc'], 2)}; 0.5 is guessing"
+        yield Finding(claim, membership.verdict(of["auc"]), evidence, of["auc"]["n"])
 
 
 JUDGES: dict[str, Callable[[Mapping[str, Any]], Iterator[Finding]]] = {
@@ -205,7 +207,7 @@ def _kept(variants: Mapping[str, Any], label: str, other: str | None, claim: str
     if change:
         whose = "the control's" if other else "the base's"
         evidence = f"kept success {percent(change)} on {whose}; at most {POINTS:.0%} lost asked"
-        yield Finding(claim, judged(change, -POINTS, below=False), evidence)
+        yield Finding(claim, judged(change, -POINTS, below=False), evidence, change["n"])
 
 
 def table(folder: Path = RESULTS, judges: Mapping[str, Callable] = JUDGES) -> str:
@@ -218,9 +220,8 @@ def table(folder: Path = RESULTS, judges: Mapping[str, Callable] = JUDGES) -> st
             missing.append(Path(study).name)
             continue
         document = json.loads(path.read_text())
-        seeds = document["asked"]["seeds"]
         rows += [
-            [f"[{Path(study).name}](results/{study}.md)", of.claim, f"**{of.verdict}**", of.evidence, str(seeds)]
+            [f"[{Path(study).name}](results/{study}.md)", of.claim, f"**{of.verdict}**", of.evidence, str(of.seeds)]
             for of in judge(document)
         ]
     text = markdown_table(["study", "claim", "here", "evidence", "seeds"], rows) if rows else ""

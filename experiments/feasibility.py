@@ -31,8 +31,8 @@ Every clip of the G1 from its first frame, without reset noise, by the mean acti
 earlier: the cross-entropy method ({rounds} rounds of {rollouts} rollouts) on what is added to the policy's actions
 over {window} control steps, for tracking reward and for not falling, then and in the {after} steps after them. It
 goes on for {noisy_rounds} rounds whose every rollout has other reset noise. Seed 0.
-`python experiments/feasibility.py CHECKPOINT` measures it again (some five minutes a clip on two cores), `--draw`
-rewrites this page from `results/feasibility.json`.
+`.venv/bin/python experiments/feasibility.py CHECKPOINT` measures it again (some five minutes a clip on two cores),
+`--draw` rewrites this page from `results/feasibility.json`.
 
 | clip | policy falls at frame | searched from | policy lives | search lives | tracking of both | under noise |
 |---|---|---|---|---|---|---|

@@ -30,8 +30,8 @@ TEXT = """# The policy gradient's noise and bias
 
 The policy `{policy}` ({environment_steps:,} environment steps, trained with λ = {trained_lambda:g}): {groups} states it
 meets in training, {branches} rollouts of {steps} control steps from each; seed 0.
-`python experiments/gradient_noise.py CHECKPOINT` measures it again (some ten minutes on two cores), `--draw` rewrites
-this page from `results/gradient_noise.json`.
+`.venv/bin/python experiments/gradient_noise.py CHECKPOINT` measures it again (some ten minutes on two cores), `--draw`
+rewrites this page from `results/gradient_noise.json`.
 
 ## Noise: the first step's advantage
 

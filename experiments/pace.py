@@ -67,7 +67,7 @@ EARLIER = {
 
 TEXT = """# Unlearning's pace on a laptop
 
-λ = 16, 20 episodes a clip; intervals over the episodes. `python experiments/pace.py` writes this page from
+λ = 16, 20 episodes a clip; intervals over the episodes. `.venv/bin/python experiments/pace.py` writes this page from
 `results/pace/`.
 
 ## Share of the starts
@@ -78,26 +78,27 @@ On the base of 88.2 M steps.
 On the shipped base of 103.0 M steps.
 
 {share_shipped}
-- The better a base is, the more there is to forget: this one punches and kicks every time, and 320 iterations leave the
-  punch half-way. Uniform starts make {none_first:.0f} % of the steps of iterations 10 to 50 the targets', and
-  {none_last:.0f} % of the last 50, for their clips are short and the policy soon falls in them.
-- With half of the starts (`sampling.target_share`) it is {share_first:.0f} and {share_last:.0f} %, 200 iterations do,
-  and what is kept hardly pays more for it: the anchor holds it whatever its share of the steps is. Between two and
-  three fifths one seed tells no difference from noise.
-- The other samplers keep the share that their rule gives, so that they can be compared; `comparison` has uniform starts
-  without the share too. The trials below were without it.
+- The better a base is, the more there is to forget: these punch and kick every time. On the one of 88.2 M steps 320
+  iterations of uniform starts leave a quarter of the skill, mostly the punch's: of the steps of iterations 10 to 50,
+  {none_first:.0f} % are the targets', and {none_last:.0f} % of the last 50, for their clips are short and the policy soon
+  falls in them.
+- With half of the starts (`sampling.target_share`), on the shipped base, they have {share_first:.0f} and
+  {share_last:.0f} %, 200 iterations do, and what is kept hardly pays more for it: the anchor holds it whatever its share of the steps is.
+  Between two and three fifths one seed tells no difference from noise.
+- By default the other samplers keep the share that their rule gives, so that they can be compared; `comparison` has
+  uniform starts without the share too. The trials below were without it.
 
 ## Distilling
 
 `METHOD=distill` on the shipped base: a fresh policy, the anchor at 1 and more epochs and mini-batches.
 
 {distill}
-- What is kept is nearly there after 200 iterations; the spin and a dance take longer.
+- What is kept is nearly there after 200 iterations; the spin and dance_a, then in some four of five, take longer.
 - The better it does what is kept, the more of the targets it can, which it never lived.
 
 ## Length
 
-On the base of 54.3 M steps, the shipped one of an earlier day.
+On the base of 54.3 M steps, shipped before this one.
 
 {shipped}
 - At 240 iterations more of the targets is left than at 320, whatever is done to hurry; larger steps and more epochs are
@@ -105,7 +106,7 @@ On the base of 54.3 M steps, the shipped one of an earlier day.
 
 ## Anchor and equal clips
 
-On the base of 52.3 M steps, the shipped one without its last stage.
+On the base of 52.3 M steps, after stage 15 of the shipped one's 27.
 
 {table}
 ¹ The anchor held the actions' mean and not yet their spread.

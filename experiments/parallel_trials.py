@@ -25,7 +25,7 @@ ITERATIONS, SETTLED = 20, 10  # of each training; those after the tenth count
 TEXT = """# Several trainings at once
 
 Fine-tuning of the shipped G1 base with the cpu preset on {cores} cores, as processes of their own, {rounds} alternating
-rounds. `python experiments/parallel_trials.py` measures it again, `--draw` rewrites this page from
+rounds. `.venv/bin/python experiments/parallel_trials.py` measures it again, `--draw` rewrites this page from
 `results/parallel_trials.json`.
 
 | trainings at once | environment steps/s of all together, over one alone: median | lowest | highest |

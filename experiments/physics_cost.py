@@ -25,7 +25,7 @@ TEXT = """# What a physics step costs
 
 MuJoCo {mujoco}, the G1 with {joints} joints in {states} states that the shipped base meets on all clips, one thread;
 {contacts:.1f} contacts, {constraints:.1f} constraint rows and {iterations:.1f} solver iterations a step on average.
-`python experiments/physics_cost.py` measures it again (a minute), `--draw` rewrites this page from
+`.venv/bin/python experiments/physics_cost.py` measures it again (a minute), `--draw` rewrites this page from
 `results/physics_cost.json`.
 
 | part of a step | share |

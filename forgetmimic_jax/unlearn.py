@@ -151,6 +151,8 @@ def config_of_new_run(options: Options) -> Config:
     if start == "fresh":
         # The base may be an unlearned policy, whose settings held it to its own base.
         config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, anchor=0.0))
+        if not info.environment_steps and options.iterations is None:
+            raise InputError(f"--iterations: {info.path} does not say how long it was trained; say how long to retrain")
         iterations = max(1, round(info.environment_steps / (config.ppo.num_envs * config.ppo.num_steps)))
     elif config.preset == "cpu":
         # A base's last training may have been slowed down to settle it, and forgetting has to be done in its budget:

@@ -8,6 +8,7 @@ from miniature import TINY, finished
 from trees import assert_same
 
 from forgetmimic_jax import checkpoint, importers, runner, unlearn
+from forgetmimic_jax.errors import InputError
 from forgetmimic_jax.exchange import imported
 from forgetmimic_jax.exchange.onnx_actor import to_onnx
 from forgetmimic_jax.options import override
@@ -33,6 +34,13 @@ def test_the_checkpoint_acts_as_rsl_rl_did(imported_run):
     found = np.asarray(mean_action(policy, info.config, original["observations"]))
     assert inside.sum() >= 15
     np.testing.assert_allclose(found[inside], original["actions"][inside], rtol=1e-5, atol=1e-5)
+
+
+def test_how_long_to_retrain_it_has_to_be_said(imported_run):
+    asked = {"base": imported_run.folder, "targets": "turn", "method": "retrain"}
+    with pytest.raises(InputError, match=r"--iterations: .* does not say how long it was trained"):
+        unlearn.config_of_new_run(unlearn.Options(**asked))
+    assert unlearn.config_of_new_run(unlearn.Options(**asked, iterations=3)).unlearn.method == "retrain"
 
 
 def test_unlearning_starts_from_it(imported_run):
