@@ -80,10 +80,11 @@ On the shipped base of 103.0 M steps.
 {share_shipped}
 - The better a base is, the more there is to forget: these punch and kick every time. On the one of 88.2 M steps 320
   iterations of uniform starts leave a quarter of the skill, mostly the punch's: of the steps of iterations 10 to 50,
-  {none_first:.0f} % are the targets', and {none_last:.0f} % of the last 50, for their clips are short and the policy soon
-  falls in them.
+  {none_first:.0f} % are the targets', and {none_last:.0f} % of the last 50, for their clips are short and the policy
+  soon falls in them.
 - With half of the starts (`sampling.target_share`), on the shipped base, they have {share_first:.0f} and
-  {share_last:.0f} %, 200 iterations do, and what is kept hardly pays more for it: the anchor holds it whatever its share of the steps is.
+  {share_last:.0f} %, 200 iterations do, and what is kept hardly pays more for it: the anchor holds it whatever its
+  share of the steps is.
   Between two and three fifths one seed tells no difference from noise.
 - By default the other samplers keep the share that their rule gives, so that they can be compared; `comparison` has
   uniform starts without the share too. The trials below were without it.
