@@ -1,17 +1,17 @@
 """Are several small trainings faster at once than one after the other? `python experiments/parallel_trials.py`.
 
-Each is a process of its own, as a sweep's trials are, with as many threads as it likes. Run it with nothing else on the
-cores (some five minutes on two); `--draw` rewrites the page from the JSON alone.
+As processes of their own, as a sweep's trials are, each with as many threads as it likes; or vmapped into one. Run it
+with nothing else on the cores (some seven minutes on two); `--draw` rewrites the page from the JSON alone.
 """
 
 from __future__ import annotations
 
-import json
+import dataclasses
 import os
 import statistics
 import subprocess
 import sys
-import tempfile
+import time
 from pathlib import Path
 
 from forgetmimic_jax.study import measured_page
@@ -19,57 +19,83 @@ from forgetmimic_jax.study import measured_page
 HERE = Path(__file__).parent
 RESULT = HERE / "results" / "parallel_trials.json"
 PAGE = HERE / "parallel_trials.md"
-JOBS, ROUNDS = (1, 2), 2
-ITERATIONS, SETTLED = 20, 10  # of each training; those after the tenth count
+ARMS = {"one": (1, 1), "two processes": (2, 1), "two vmapped": (1, 2)}  # processes, members
+ROUNDS = 2
+ITERATIONS, SETTLED = 40, 10  # of each training; those after the tenth count
 
 TEXT = """# Several trainings at once
 
-Fine-tuning of the shipped G1 base with the cpu preset on {cores} cores, as processes of their own, {rounds} alternating
-rounds. `.venv/bin/python experiments/parallel_trials.py` measures it again, `--draw` rewrites this page from
-`results/parallel_trials.json`.
+`make unlearn` of the shipped G1 on {cores} cores: iterations {settled} to {iterations} of trainings that start at once,
+{rounds} alternating rounds. `.venv/bin/python experiments/parallel_trials.py` measures it again (on quiet cores, some
+seven minutes), `--draw` rewrites this page from `results/parallel_trials.json`.
 
 | trainings at once | environment steps/s of all together, over one alone: median | lowest | highest |
 |---|---|---|---|
 {rows}
 
-`--jobs` of the studies and sweeps is how many of their trials run at once.
+Vmapped, one program makes both policies' iterations and the physics of one member after the other. Sweeps and studies
+run processes: `--jobs` is how many. One that fails or is stopped leaves the others alone.
 """
 
 
-def rate(jobs: int) -> float:
-    """Environment steps/s of `jobs` trainings together."""
-    with tempfile.TemporaryDirectory() as folder:
-        outputs = [Path(folder) / str(job) for job in range(jobs)]
-        command = [sys.executable, "-m", "forgetmimic_jax.train", "--base", "data/g1/base", "--iterations"]
-        command += [str(ITERATIONS), "--set", "evaluate_every=0", "--output"]
-        running = [subprocess.Popen([*command, str(output)], stdout=subprocess.DEVNULL) for output in outputs]
-        for process in running:
-            if process.wait():
-                raise SystemExit(f"{' '.join(command)}: exit code {process.returncode}")
-        total = 0.0
-        for output in outputs:
-            rows = [json.loads(line) for line in (output / "metrics.jsonl").read_text().splitlines()]
-            start, end = (next(row for row in rows if row["iteration"] == at) for at in (SETTLED, ITERATIONS))
-            seconds = sum(row["seconds"] for row in rows if row["iteration"] > SETTLED)
-            total += (end["environment_steps"] - start["environment_steps"]) / seconds
-        return total
+def train(members: int) -> float:
+    """Environment steps/s of an unlearning run, or of several with other seeds vmapped into one."""
+    import jax
+    import jax.numpy as jnp
+
+    from forgetmimic_jax import runner, unlearn
+    from forgetmimic_jax.ppo.update import make_iteration
+
+    config = unlearn.config_of_new_run(unlearn.Options())
+    setup = runner.with_base(runner.make_setup(config))
+    iterate = make_iteration(setup.env)
+    states = [
+        runner.start_state(dataclasses.replace(setup, config=dataclasses.replace(config, seed=seed)))
+        for seed in range(members)
+    ]
+    state = states[0]
+    if members > 1:
+        state = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+        iterate = jax.jit(jax.vmap(iterate, in_axes=(None, 0)), donate_argnums=1)
+    for iteration in range(ITERATIONS):
+        if iteration == SETTLED:
+            start = time.perf_counter()
+        state, metrics = iterate(setup.assets, state)
+        jax.block_until_ready(metrics)
+    steps = members * (ITERATIONS - SETTLED) * config.ppo.num_envs * config.ppo.num_steps
+    return steps / (time.perf_counter() - start)
+
+
+def rate(processes: int, members: int) -> float:
+    """Environment steps/s of all processes together."""
+    command = [sys.executable, __file__, "--members", str(members)]
+    running = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(processes)]
+    printed = [process.communicate()[0] for process in running]
+    if any(process.returncode for process in running):
+        raise SystemExit(f"{' '.join(command)} failed")
+    return sum(float(text.split()[-1]) for text in printed)
 
 
 def measure() -> dict:
-    """All together over one alone of the same round, for each number of trainings."""
-    rounds = [[rate(jobs) for jobs in JOBS] for _ in range(ROUNDS)]
-    ratios = {str(jobs): [found[place] / found[0] for found in rounds] for place, jobs in enumerate(JOBS)}
-    return {"cores": os.cpu_count(), "rounds": ROUNDS, "ratios": ratios}
+    """Each arm over one alone of the same round."""
+    rounds = [{arm: rate(*of) for arm, of in ARMS.items()} for _ in range(ROUNDS)]
+    ratios = {arm: [found[arm] / found["one"] for found in rounds] for arm in ARMS}
+    return {"cores": os.cpu_count(), "rounds": ROUNDS, "iterations": [SETTLED, ITERATIONS], "ratios": ratios}
 
 
 def page(found: dict) -> str:
     """The page of the stored numbers."""
     rows = [
-        f"| {jobs} | {statistics.median(ratios):.2f} | {min(ratios):.2f} | {max(ratios):.2f} |"
-        for jobs, ratios in found["ratios"].items()
+        f"| {arm} | {statistics.median(ratios):.2f} | {min(ratios):.2f} | {max(ratios):.2f} |"
+        for arm, ratios in found["ratios"].items()
     ]
-    return TEXT.format(cores=found["cores"], rounds=found["rounds"], rows="\n".join(rows))
+    settled, iterations = found["iterations"]
+    told = {"settled": settled + 1, "iterations": iterations, "rows": "\n".join(rows)}
+    return TEXT.format(cores=found["cores"], rounds=found["rounds"], **told)
 
 
 if __name__ == "__main__":
-    measured_page(measure, page, RESULT, PAGE)
+    if sys.argv[1:2] == ["--members"]:
+        print(train(int(sys.argv[2])))
+    else:
+        measured_page(measure, page, RESULT, PAGE)

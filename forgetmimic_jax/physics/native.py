@@ -28,7 +28,8 @@ _VELOCITY_STAGE = int(mujoco.mjtStage.mjSTAGE_VEL)
 class NativeEngine:
     """A `mujoco.batch.Batch` whose rows are only scratch: every call loads the state it is given.
 
-    Purity is what allows `jax.pure_callback`: nothing of one call is felt by the next.
+    Purity is what allows `jax.pure_callback`: nothing of one call is felt by the next. Under `vmap`, as of a whole
+    iteration over several trainings, the members are stepped one after the other.
     """
 
     def __init__(self, robot: Robot, substeps: int, num_envs: int, num_threads: int = 0):
@@ -68,6 +69,7 @@ class NativeEngine:
             self._step_host,
             shapes,
             (state.qpos, state.qvel, state.warmstart, parameters.foot_friction, parameters.torso_com, target, wrench),
+            vmap_method="sequential",
         )
         return PhysicsState(qpos, qvel, warmstart), body_state(xpos, xquat, cvel, com, force)
 
@@ -77,6 +79,7 @@ class NativeEngine:
             self._forward_host,
             self._body_shapes,
             (state.qpos, state.qvel, state.warmstart, parameters.foot_friction, parameters.torso_com, mask),
+            vmap_method="sequential",
         )
         fresh = body_state(xpos, xquat, cvel, com, jnp.zeros_like(bodies.contact_force))
         return select_rows(mask, fresh, bodies)

@@ -183,6 +183,14 @@ def test_rollout_inside_jit_equals_a_loop(native, inputs):
     assert_same_bits(final, state)
 
 
+def test_members_of_a_vmap_are_stepped_as_if_alone(robot, native, inputs, native_result):
+    """Whole trainings can be vmapped, for which each member's batch is stepped in turn."""
+    other = rest_inputs(robot, len(CASES))
+    both = jax.vmap(native.step)(*jax.tree.map(lambda *leaves: jnp.stack(leaves), inputs, other))
+    assert_same_bits(jax.tree.map(lambda x: x[0], both), native_result)
+    assert_same_bits(jax.tree.map(lambda x: x[1], both), native.step(*other))
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e12])
 def test_a_diverged_row_is_not_finite_and_alone(native, inputs, native_result, value, capfd, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
