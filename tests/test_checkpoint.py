@@ -89,6 +89,8 @@ def test_a_save_replaces_the_one_before_and_leaves_nothing_else(tmp_path, state,
     assert checkpoint.load_state(path, template).iteration == 2
 
 
+# Orbax leaves a callback behind that finds its event loop closed.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_what_the_system_refuses_is_an_oserror_and_leaves_nothing(tmp_path, saved, state, setup):
     # A limit on the size of files is a refusal that needs no full disk and no privileges.
     unlimited = resource.getrlimit(resource.RLIMIT_FSIZE)
