@@ -35,7 +35,8 @@ NONE = 0.05  # of episodes: a success rate below it counts as none
 POINTS = 0.05  # of success that kept clips may lose
 SOONER = 1.0  # steps by which an episode may end before doing nothing would end it
 CONTROL = "distilled"  # never lived a target, and is made in minutes: what relearning is compared with
-ARFT, UNIFORM = "arft", "arft, uniform clips"
+ARFT, UNIFORM, ADAPTIVE = "arft", "arft, uniform clips", "arft, adaptive"
+SAMPLERS = (UNIFORM, "arft, uniform bins", "arft, frozen", ADAPTIVE)
 
 
 @dataclass(frozen=True)
@@ -61,15 +62,32 @@ def judged(value: Estimate, bound: float, *, below: bool = True) -> str:
 
 def gained(variants: Mapping[str, Any], label: str, other: str | None, group: str, metric: str) -> Estimate | None:
     """A variant's number less another's of the same seed, or less the base's; None where no seed has both."""
+    found = _gained(variants, label, other, group, metric)
+    return statistics.over_seeds(list(found.values())) if found else None
+
+
+def effect(variants: Mapping[str, Any], pairs: Sequence[tuple[str, str]], group: str) -> Estimate | None:
+    """What one switch changes in tracking: the mean of its `gained`, whatever else is set; None where no seed has all.
+
+    Args:
+        variants: of the comparison.
+        pairs: the variants with and without it.
+        group: target or kept.
+    """
+    each = [_gained(variants, *pair, group, TRACKING) for pair in pairs]
+    means = [float(np.mean([of[seed] for of in each])) for seed in each[0] if all(seed in of for of in each)]
+    return statistics.over_seeds(means) if means else None
+
+
+def _gained(variants: Mapping[str, Any], label: str, other: str | None, group: str, metric: str) -> dict[str, float]:
     if label not in variants or (other and other not in variants):
-        return None
+        return {}
     mine = variants[label]["seeds"]
     theirs = {seed: run["policy"] for seed, run in variants[other]["seeds"].items()} if other else {
         seed: run["base"] for seed, run in mine.items()
     }  # fmt: skip
     both = [seed for seed in mine if seed in theirs]
-    pairs = [(mine[seed]["policy"][group][metric], theirs[seed][group][metric]) for seed in both]
-    return statistics.over_seeds([a - b for a, b in pairs]) if pairs else None
+    return {seed: mine[seed]["policy"][group][metric] - theirs[seed][group][metric] for seed in both}
 
 
 def of_validity(document: Mapping[str, Any]) -> Iterator[Finding]:
@@ -102,13 +120,23 @@ def of_comparison(document: Mapping[str, Any]) -> Iterator[Finding]:
         if target:
             evidence = f"target tracking {number(target, 2)} on λ = 16's"
             yield Finding(f"{method} forgets less", judged(target, 0.0, below=False), evidence, target["n"])
-    for label, name in (("arft, adaptive", "adaptive RSI"), ("arft, uniform clips, wrench", "the wrench")):
+    with_wrench = {label: f"{label}, wrench" for label in SAMPLERS}
+    switches = {
+        "adaptive RSI": (
+            [(ADAPTIVE, UNIFORM), (with_wrench[ADAPTIVE], with_wrench[UNIFORM])],
+            "than with uniform clips, mean of wrench and none",
+        ),
+        "the wrench": (
+            [(wrench, label) for label, wrench in with_wrench.items()],
+            "than without, mean of the samplers",
+        ),
+    }
+    for name, (pairs, otherwise) in switches.items():
         for group, claim in (("target", f"{name} resists forgetting"), ("kept", f"{name} costs the kept clips")):
-            change = gained(variants, label, UNIFORM, group, TRACKING)
+            change = effect(variants, pairs, group)
             if change:
                 verdict = judged(change, 0.0, below=group == "kept")
-                evidence = f"{group} tracking {number(change, 2)} on that of {UNIFORM}"
-                yield Finding(claim, verdict, evidence, change["n"])
+                yield Finding(claim, verdict, f"{group} tracking {number(change, 2)} more {otherwise}", change["n"])
 
 
 def of_penalty(document: Mapping[str, Any]) -> Iterator[Finding]:

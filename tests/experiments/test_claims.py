@@ -53,15 +53,22 @@ def test_the_comparisons_claims_by_hand():
         claims.comparison.CONTROL: variant([0.8, 0.8, 0.8], [0.60, 0.61, 0.62]),
         "decremental": variant([0.0, 0.0, 0.0], [0.2, 0.21, 0.22]),
         claims.UNIFORM: variant([0.2, 0.2, 0.2], [0.59, 0.60, 0.61]),
-        "arft, adaptive": variant([0.4, 0.3, 0.2], [0.4, 0.6, 0.5]),
+        f"{claims.UNIFORM}, wrench": variant([0.3, 0.2, 0.2], [0.6, 0.6, 0.6]),
+        claims.ADAPTIVE: variant([0.4, 0.3, 0.2], [0.4, 0.6, 0.5]),
+        f"{claims.ADAPTIVE}, wrench": variant([0.4, 0.5, 0.6], [0.4, 0.6, 0.5]),
     }
     found = {of.claim: of.verdict for of in claims.of_comparison({"results": {"variants": compared}})}
     assert found == {
         "λ = 16: the kept clips are what fine-tuning without an anti-reward gives": "holds",
         "decremental hurts the kept clips more": "holds",
-        "adaptive RSI resists forgetting": "open",
+        "adaptive RSI resists forgetting": "holds",
         "adaptive RSI costs the kept clips": "open",
     }
+    adaptive = [(claims.ADAPTIVE, claims.UNIFORM), (f"{claims.ADAPTIVE}, wrench", f"{claims.UNIFORM}, wrench")]
+    by_hand = [(0.2 + 0.1) / 2, (0.1 + 0.3) / 2, (0.0 + 0.4) / 2]
+    assert claims.effect(compared, adaptive, "target") == pytest.approx(over_seeds(by_hand))
+    compared[claims.UNIFORM] = variant([0.2], [0.6])
+    assert claims.effect(compared, adaptive, "target") == {"mean": pytest.approx(0.15), "n": 1}
 
 
 def test_a_policy_that_falls_sooner_than_doing_nothing_has_not_lost_a_skill():
