@@ -191,22 +191,26 @@ def of_relearning(document: Mapping[str, Any]) -> Iterator[Finding]:
         return
     for share in relearning.SHARES:
         claim = f"{share:.0%} of the tracking comes back no sooner than it comes to a {CONTROL} policy"
-        reached = {label: crossings(results, label, share) for label in ("unlearned", CONTROL)}
-        lasted = {
-            label: [pair[1] if pair else curve["target_steps"][-1] for pair, curve in
-                    zip(of, results["starts"][label].values(), strict=True)]
-            for label, of in reached.items()
-        }  # fmt: skip
-        mine, theirs = statistics.over_seeds(lasted["unlearned"]), float(np.mean(lasted[CONTROL]))
-        never = {label: of.count(None) for label, of in reached.items()}
-        verdict = "open" if never["unlearned"] else judged(mine, theirs, below=False)
-        if never[CONTROL] and verdict in ("holds", "one seed: yes"):
-            verdict = "open"  # the control's mean is a lower bound
-        evidence = f"{number(mine, 0)} target steps from the unlearned policy, {theirs:,.0f} from the {CONTROL}"
-        ends = [f"{label} in {count} of {len(reached[label])} runs" for label, count in never.items() if count]
+        reached, lasted = {}, {}
+        for label in ("unlearned", CONTROL):
+            runs = results["starts"][label]
+            reached[label] = dict(zip(runs, crossings(results, label, share), strict=True))
+            lasted[label] = {
+                seed: pair[1] if pair else runs[seed]["target_steps"][-1] for seed, pair in reached[label].items()
+            }
+        both = [seed for seed in lasted["unlearned"] if seed in lasted[CONTROL]]
+        sooner = statistics.over_seeds([lasted["unlearned"][seed] - lasted[CONTROL][seed] for seed in both])
+        never = {label: [of[seed] for seed in both].count(None) for label, of in reached.items()}
+        verdict = judged(sooner, 0.0, below=False)
+        # A run that never got there counts with its end, which is too early.
+        if never["unlearned"] or (never[CONTROL] and verdict in ("holds", "one seed: yes")):
+            verdict = "open"
+        mean = float(np.mean([lasted[CONTROL][seed] for seed in both]))
+        evidence = f"{number(sooner, 0)} target steps more than the {mean:,.0f} of the {CONTROL} one of the same seed"
+        ends = [f"{label} in {count} of {len(both)} runs" for label, count in never.items() if count]
         if ends:
             evidence += f"; not reached, counted with the run's end: {' and '.join(ends)}"
-        yield Finding(claim, verdict, evidence, mine["n"])
+        yield Finding(claim, verdict, evidence, sooner["n"])
 
 
 def of_membership(document: Mapping[str, Any]) -> Iterator[Finding]:

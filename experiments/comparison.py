@@ -70,6 +70,7 @@ def differences(variants: Mapping[str, Any], label: str) -> list[str]:
 STUDY = Study(
     name="comparison",
     title="Every method at the same budget",
+    retrains=True,
     measure=measure,
     tell=tell,
     draw=lambda document: variant_bars(document["results"]["variants"]),

@@ -99,6 +99,7 @@ def draw(document: Mapping[str, Any]) -> Figure:
 STUDY = Study(
     name="membership",
     title="Can one tell that a policy was trained on the targets?",
+    retrains=True,
     measure=measure,
     tell=tell,
     draw=draw,

@@ -146,6 +146,7 @@ STUDY = Study(
     name="relearning",
     title="How fast does a forgotten motion come back?",
     iterations={"cpu": 300, "paper": 10_000},
+    retrains=True,
     measure=measure,
     tell=tell,
     draw=draw,

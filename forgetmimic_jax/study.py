@@ -53,7 +53,7 @@ class Options:
     iterations: int | None = None
     """PPO iterations of each trial; the budget's by default."""
     control_iterations: int | None = None
-    """Iterations of the retrained and fresh controls; as many steps as the base was trained for by default."""
+    """Iterations of the retrained control; as many steps as the base was trained for by default."""
     seeds: int = 3
     """Runs of each kind, with the seeds 0, 1, ...: what intervals are over."""
     episodes: int = 20
@@ -86,6 +86,7 @@ class Study:
         draw: (document) → its figure.
         iterations: of each trial, by budget; those of `forgetmimic_jax.unlearn` by default.
         asks: what beside the options the answer depends on, such as the values of a sweep.
+        retrains: whether a retrained control is among its trials.
     """
 
     name: str
@@ -95,6 +96,7 @@ class Study:
     draw: Callable[[Mapping[str, Any]], Figure]
     iterations: Mapping[str, int] = field(default_factory=lambda: ITERATIONS)
     asks: Sequence[str] = ()
+    retrains: bool = False
 
 
 class Lab:
@@ -156,7 +158,6 @@ class Lab:
             "targets": list(self.targets),
             "budget": self.options.budget,
             "iterations": self.iterations,
-            "control_iterations": self.control_iterations,
             "seeds": len(self.seeds),
             "episodes": self.options.episodes,
             "set": list(itertools.chain(*self.options.set)),
@@ -319,6 +320,8 @@ def conduct(study: Study, options: Options, next_command: str) -> None:
         iterations = study.iterations[options.budget] if options.iterations is None else options.iterations
         lab = Lab(options, iterations, known_trials(folder))
         asked = lab.asked() | {"asks": list(study.asks)}
+        if study.retrains:
+            asked["control_iterations"] = lab.control_iterations
         if document is None or document["asked"] != asked or document["failed"]:
             results, stopped = study.measure(lab), lab.stopped
             document = {"schema": 1, "study": study.name, "asked": asked, "failed": lab.failed, "results": results}

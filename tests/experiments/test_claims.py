@@ -90,21 +90,27 @@ def test_what_comes_back_sooner_than_it_is_learned_was_not_forgotten():
         tracking = [0.9 if step >= at else 0.1 for step in range(6)]
         return {"iterations": list(range(6)), "target_steps": [100.0 * step for step in range(6)], "tracking": tracking}
 
-    def found(unlearned: list[int], distilled: int) -> claims.Finding:
-        mine = {str(seed): curve(at) for seed, at in enumerate(unlearned)}
-        starts = {"unlearned": mine, "distilled": {"0": curve(distilled)}}
+    def found(unlearned: list[int], distilled: list[int]) -> claims.Finding:
+        starts = {
+            label: {str(seed): curve(at) for seed, at in enumerate(of)}
+            for label, of in (("unlearned", unlearned), ("distilled", distilled))
+        }
         every = list(claims.of_relearning({"results": {"base": dict.fromkeys("012", 0.9), "starts": starts}}))
         assert len({of.verdict for of in every}) == 1
         return every[0]
 
-    assert found([1, 2, 1], 4).verdict == "does not hold"
-    assert found([3, 4, 3], 1).verdict == "holds"
-    never = found([1, 2, 1], 9)
-    assert never.verdict == "does not hold"  # later than its run's end, which is late enough
-    assert never.evidence.endswith("not reached, counted with the run's end: distilled in 1 of 1 runs")
-    assert found([1, 9, 1], 9).verdict == "open"
-    assert found([4], 9).verdict == "one seed: no"
-    assert found([9], 9).verdict == "open"
+    sooner = found([1, 2, 1], [4, 4, 4])
+    assert sooner.verdict == "does not hold"
+    assert sooner.evidence.startswith("-267 [-410, -123] target steps more than the 400 of the distilled one")
+    assert found([3, 4, 3], [1, 1, 1]).verdict == "holds"
+    assert found([1, 2, 1], [1, 1, 4]).verdict == "open"
+    never = found([1, 2, 1], [4, 9, 9])
+    assert never.verdict == "does not hold"  # later than their runs' ends, which is late enough
+    assert never.evidence.endswith("not reached, counted with the run's end: distilled in 2 of 3 runs")
+    assert found([1, 9, 1], [4, 4, 4]).verdict == "open"
+    assert found([4], [1]).verdict == "one seed: yes"
+    assert found([4], [9]).verdict == "one seed: no"
+    assert found([9], [4]).verdict == "open"
 
 
 def test_the_table_names_what_is_not_measured(tmp_path):
