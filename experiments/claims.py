@@ -19,7 +19,8 @@ import numpy as np
 from experiments import comparison, membership, relearning
 from forgetmimic_jax.errors import InputError, run_command
 from forgetmimic_jax.evaluation import statistics
-from forgetmimic_jax.evaluation.relearning import crossings
+from forgetmimic_jax.evaluation import variants as of_variants
+from forgetmimic_jax.evaluation.relearning import lasted
 from forgetmimic_jax.evaluation.statistics import Estimate
 from forgetmimic_jax.evaluation.tables import FORGOTTEN, markdown_table, number, percent
 from forgetmimic_jax.evaluation.variants import within
@@ -62,7 +63,7 @@ def judged(value: Estimate, bound: float, *, below: bool = True) -> str:
 
 def gained(variants: Mapping[str, Any], label: str, other: str | None, group: str, metric: str) -> Estimate | None:
     """A variant's number less another's of the same seed, or less the base's; None where no seed has both."""
-    found = _gained(variants, label, other, group, metric)
+    found = of_variants.gained(variants, label, other, group, metric)
     return statistics.over_seeds(list(found.values())) if found else None
 
 
@@ -74,20 +75,9 @@ def effect(variants: Mapping[str, Any], pairs: Sequence[tuple[str, str]], group:
         pairs: the variants with and without it.
         group: target or kept.
     """
-    each = [_gained(variants, *pair, group, TRACKING) for pair in pairs]
+    each = [of_variants.gained(variants, *pair, group, TRACKING) for pair in pairs]
     means = [float(np.mean([of[seed] for of in each])) for seed in each[0] if all(seed in of for of in each)]
     return statistics.over_seeds(means) if means else None
-
-
-def _gained(variants: Mapping[str, Any], label: str, other: str | None, group: str, metric: str) -> dict[str, float]:
-    if label not in variants or (other and other not in variants):
-        return {}
-    mine = variants[label]["seeds"]
-    theirs = {seed: run["policy"] for seed, run in variants[other]["seeds"].items()} if other else {
-        seed: run["base"] for seed, run in mine.items()
-    }  # fmt: skip
-    both = [seed for seed in mine if seed in theirs]
-    return {seed: mine[seed]["policy"][group][metric] - theirs[seed][group][metric] for seed in both}
 
 
 def of_validity(document: Mapping[str, Any]) -> Iterator[Finding]:
@@ -191,21 +181,16 @@ def of_relearning(document: Mapping[str, Any]) -> Iterator[Finding]:
         return
     for share in relearning.SHARES:
         claim = f"{share:.0%} of the tracking comes back no sooner than it comes to a {CONTROL} policy"
-        reached, lasted = {}, {}
-        for label in ("unlearned", CONTROL):
-            runs = results["starts"][label]
-            reached[label] = dict(zip(runs, crossings(results, label, share), strict=True))
-            lasted[label] = {
-                seed: pair[1] if pair else runs[seed]["target_steps"][-1] for seed, pair in reached[label].items()
-            }
-        both = [seed for seed in lasted["unlearned"] if seed in lasted[CONTROL]]
-        sooner = statistics.over_seeds([lasted["unlearned"][seed] - lasted[CONTROL][seed] for seed in both])
-        never = {label: [of[seed] for seed in both].count(None) for label, of in reached.items()}
+        mine, theirs = (lasted(results, label, share) for label in ("unlearned", CONTROL))
+        both = [seed for seed in mine if seed in theirs]
+        sooner = statistics.over_seeds([mine[seed].target_steps - theirs[seed].target_steps for seed in both])
+        never = {
+            label: sum(not of[seed].there for seed in both) for label, of in (("unlearned", mine), (CONTROL, theirs))
+        }
         verdict = judged(sooner, 0.0, below=False)
-        # A run that never got there counts with its end, which is too early.
         if never["unlearned"] or (never[CONTROL] and verdict in ("holds", "one seed: yes")):
             verdict = "open"
-        mean = float(np.mean([lasted[CONTROL][seed] for seed in both]))
+        mean = float(np.mean([theirs[seed].target_steps for seed in both]))
         evidence = f"{number(sooner, 0)} target steps more than the {mean:,.0f} of the {CONTROL} one of the same seed"
         ends = [f"{label} in {count} of {len(both)} runs" for label, count in never.items() if count]
         if ends:

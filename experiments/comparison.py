@@ -8,7 +8,7 @@ from typing import Any
 from experiments.validity import PLAIN
 from forgetmimic_jax.evaluation import paper, statistics
 from forgetmimic_jax.evaluation.tables import markdown_table, number
-from forgetmimic_jax.evaluation.variants import variant_bars, variant_table
+from forgetmimic_jax.evaluation.variants import gained, variant_bars, variant_table
 from forgetmimic_jax.study import Lab, Study, main
 from forgetmimic_jax.sweep import ablation
 
@@ -57,13 +57,12 @@ def tell(document: Mapping[str, Any]) -> str:
 
 def differences(variants: Mapping[str, Any], label: str) -> list[str]:
     """What a variant's kept clips gained on the base's and on the control's of the same seed, over the seeds."""
-    control = variants[CONTROL]["seeds"]
-    runs = {seed: run for seed, run in variants[label]["seeds"].items() if seed in control}
     cells = []
     for metric, scale, digits in (("success_rate", 100.0, 1), ("survival_weighted_tracking", 1.0, 3)):
-        for other in ({seed: runs[seed]["base"] for seed in runs}, {seed: control[seed]["policy"] for seed in runs}):
-            pairs = [(run["policy"]["kept"][metric], other[seed]["kept"][metric]) for seed, run in runs.items()]
-            cells.append(number(statistics.over_seeds([scale * (a - b) for a, b in pairs]), digits) if pairs else "")
+        for other in (None, CONTROL):
+            found = gained(variants, label, other, "kept", metric)
+            pairs = [scale * value for seed, value in found.items() if seed in variants[CONTROL]["seeds"]]
+            cells.append(number(statistics.over_seeds(pairs), digits) if pairs else "")
     return cells
 
 

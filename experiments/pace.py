@@ -84,8 +84,7 @@ On the shipped base of 103.0 M steps.
   soon falls in them.
 - With half of the starts (`sampling.target_share`), on the shipped base, they have {share_first:.0f} and
   {share_last:.0f} %, 200 iterations do, and what is kept hardly pays more for it: the anchor holds it whatever its
-  share of the steps is.
-  Between two and three fifths one seed tells no difference from noise.
+  share of the steps is. Between two and three fifths one seed tells no difference from noise.
 - By default the other samplers keep the share that their rule gives, so that they can be compared; `comparison` has
   uniform starts without the share too. The trials below were without it.
 

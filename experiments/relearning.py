@@ -16,7 +16,7 @@ import numpy as np
 
 from forgetmimic_jax.evaluation import paper, statistics
 from forgetmimic_jax.evaluation.plots import new_figure
-from forgetmimic_jax.evaluation.relearning import crossings
+from forgetmimic_jax.evaluation.relearning import lasted
 from forgetmimic_jax.evaluation.tables import markdown_table, number
 from forgetmimic_jax.rows import read_rows
 from forgetmimic_jax.study import Lab, Study, main, newest_policy
@@ -100,15 +100,13 @@ def tell(document: Mapping[str, Any]) -> str:
     """Iterations and target steps until each share of the base, over the seeds that got there."""
     results = document["results"]
     rows = []
-    for label, runs in results["starts"].items():
+    for label in results["starts"]:
         for share in SHARES:
-            found = crossings(results, label, share)
-            reached = sum(pair is not None for pair in found)
-            ends = [(curve["iterations"][-1], curve["target_steps"][-1]) for curve in runs.values()]
-            lasted = [pair or end for pair, end in zip(found, ends, strict=True)]
+            found = lasted(results, label, share).values()
+            reached = sum(run.there for run in found)
             cells = []
             for place in (0, 1):
-                mean = statistics.over_seeds([pair[place] for pair in lasted])
+                mean = statistics.over_seeds([run[place] for run in found])
                 cells.append(number(mean, 0) if reached == len(found) else f"more than {mean['mean']:,.0f}")
             rows.append([label, f"{100 * share:.0f} %", f"{reached} of {len(found)}", *cells])
     theirs = ", ".join(f"{iterations:,} for {clips}" for clips, iterations in paper.RELEARNING.items())

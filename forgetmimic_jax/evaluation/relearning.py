@@ -3,7 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
+
+
+class Lasted(NamedTuple):
+    """How long a run took until a level, or until its end where it never got there."""
+
+    iterations: float
+    target_steps: float
+    there: bool
 
 
 def crossing(curve: Mapping[str, list[float]], level: float) -> tuple[float, float] | None:
@@ -24,3 +32,13 @@ def crossings(results: Mapping[str, Any], start: str, share: float) -> list[tupl
         share: of the base's survival-weighted tracking on the targets.
     """
     return [crossing(curve, share * results["base"][seed]) for seed, curve in results["starts"][start].items()]
+
+
+def lasted(results: Mapping[str, Any], start: str, share: float) -> dict[str, Lasted]:
+    """By seed: when it crossed, as `crossings`; a run that never did counts with its end, which is too early."""
+    result = {}
+    runs = results["starts"][start].items()
+    for (seed, curve), found in zip(runs, crossings(results, start, share), strict=True):
+        iterations, steps = found or (curve["iterations"][-1], curve["target_steps"][-1])
+        result[seed] = Lasted(iterations, steps, found is not None)
+    return result

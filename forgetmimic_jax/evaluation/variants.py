@@ -63,6 +63,26 @@ def summary(folder: Path) -> dict[str, Any]:
     return result
 
 
+def gained(variants: Mapping[str, Any], label: str, other: str | None, group: str, metric: str) -> dict[str, float]:
+    """By seed: a variant's number less another's of the same seed, or less the base's; of the seeds that have both.
+
+    Args:
+        variants: of a study's results.
+        label: of the variant.
+        other: of what it is compared with; None is the base.
+        group: target or kept.
+        metric: of the group.
+    """
+    if label not in variants or (other and other not in variants):
+        return {}
+    mine = {seed: run["policy"][group][metric] for seed, run in variants[label]["seeds"].items()}
+    if other:
+        theirs = {seed: run["policy"][group][metric] for seed, run in variants[other]["seeds"].items()}
+    else:
+        theirs = {seed: run["base"][group][metric] for seed, run in variants[label]["seeds"].items()}
+    return {seed: mine[seed] - theirs[seed] for seed in mine if seed in theirs}
+
+
 def _means(metrics: Mapping[str, Any]) -> dict[str, float]:
     return {name: metrics[name]["mean"] for name in METRICS if "mean" in metrics.get(name, {})}
 

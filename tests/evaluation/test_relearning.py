@@ -1,4 +1,4 @@
-from forgetmimic_jax.evaluation.relearning import crossing, crossings
+from forgetmimic_jax.evaluation.relearning import crossing, crossings, lasted
 
 CURVE = {
     "iterations": [0, 10, 20, 30, 40],
@@ -17,3 +17,8 @@ def test_a_share_is_of_what_the_base_does_on_the_same_seeds_episodes():
     results = {"base": {"0": 0.5, "1": 1.0}, "starts": {"unlearned": {"0": CURVE, "1": CURVE}}}
     assert crossings(results, "unlearned", 0.8) == [(10, 5.0), None]
     assert crossings(results, "unlearned", 0.4) == [(10, 5.0), (10, 5.0)]
+
+
+def test_a_run_that_never_got_there_counts_with_its_end():
+    results = {"base": {"0": 0.5, "1": 1.0}, "starts": {"unlearned": {"0": CURVE, "1": CURVE}}}
+    assert lasted(results, "unlearned", 0.8) == {"0": (10, 5.0, True), "1": (40, 20.0, False)}
