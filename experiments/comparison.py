@@ -13,6 +13,7 @@ from forgetmimic_jax.study import Lab, Study, main
 from forgetmimic_jax.sweep import ablation
 
 CONTROL = "fine-tuned, all clips"
+PAPERS = ("random_reward", "decremental", "trajdeleter")  # baselines that the paper has claims about
 METHODS: dict[str, dict[str, Any]] = {
     "fine-tuned, kept clips": {"method": "finetune"},
     CONTROL: {"method": "finetune", "clips": "all"},
@@ -27,6 +28,7 @@ METHODS: dict[str, dict[str, Any]] = {
     "arft": {},
     "arft, λ = 8": {"penalty": 8.0},
     "arft, plain PPO": PLAIN,
+    **{f"{name.replace('_', ' ')}, plain PPO": {"method": name, **PLAIN} for name in PAPERS},
 }
 
 

@@ -19,8 +19,8 @@ from forgetmimic_jax.evaluation.plots import new_figure
 from forgetmimic_jax.evaluation.relearning import lasted
 from forgetmimic_jax.evaluation.tables import markdown_table, number
 from forgetmimic_jax.rows import read_rows
-from forgetmimic_jax.study import Lab, Study, main, newest_policy
-from forgetmimic_jax.unlearn import ITERATIONS, PACE, TARGET_SHARE
+from forgetmimic_jax.study import ITERATIONS, Lab, Study, main, newest_policy
+from forgetmimic_jax.unlearn import PACE, TARGET_SHARE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

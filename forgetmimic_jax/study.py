@@ -25,7 +25,6 @@ from forgetmimic_jax.evaluation.plots import save
 from forgetmimic_jax.evaluation.variants import over_seeds, summary, variant_bars, variant_table
 from forgetmimic_jax.motion.clip import write_atomically
 from forgetmimic_jax.options import Settings, at_least, comma_separated, override, replace_given
-from forgetmimic_jax.unlearn import ITERATIONS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -34,6 +33,9 @@ if TYPE_CHECKING:
     from forgetmimic_jax.motion.clip import Clip
     from forgetmimic_jax.trials import Trial
 
+# Of a trial: enough to tell variants apart. On a laptop `make unlearn` goes on for longer, and the studies of one
+# variant at that length say so.
+ITERATIONS = {"cpu": 200, "paper": 1000}
 RESULTS = Path(__file__).resolve().parents[1] / "experiments" / "results"
 K = TypeVar("K", bound=Hashable)
 
@@ -84,7 +86,7 @@ class Study:
         measure: runs the trials; the JSON's `results`.
         tell: (document) → the page's body in Markdown: tables, and what has to be said of them.
         draw: (document) → its figure.
-        iterations: of each trial, by budget; those of `forgetmimic_jax.unlearn` by default.
+        iterations: of each trial, by budget.
         asks: what beside the options the answer depends on, such as the values of a sweep.
         retrains: whether a retrained control is among its trials.
     """

@@ -18,9 +18,8 @@ from forgetmimic_jax.evaluation.plots import curve, heat_map, new_figure
 from forgetmimic_jax.evaluation.tables import FORGOTTEN, number
 from forgetmimic_jax.evaluation.variants import variant_table
 from forgetmimic_jax.options import comma_separated, parse
-from forgetmimic_jax.study import Lab, Study, conduct, variants_study
+from forgetmimic_jax.study import ITERATIONS, Lab, Study, conduct, variants_study
 from forgetmimic_jax.study import Options as StudyOptions
-from forgetmimic_jax.unlearn import ITERATIONS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -51,7 +51,8 @@ class Options:
     preset: Literal["cpu", "paper"] | None = None
     """Settings of the fine-tuning; by default the base's own, at the default budget of a laptop."""
     iterations: int | None = None
-    """PPO iterations; 200 by default (1000 with --preset paper), retrain: as many steps as the base was trained for."""
+    """PPO iterations; 480 by default (1000 with --preset paper), distill: 200,
+    retrain: as many steps as the base was trained for."""
     seed: int = 0
     """Random seed of the fine-tuning and of the evaluation."""
     base: Path | None = None
@@ -70,7 +71,7 @@ class Options:
     """Any other settings, such as ppo.learning_rate=1e-4."""
 
 
-ITERATIONS = {"cpu": 200, "paper": 1000}
+ITERATIONS = {"cpu": 480, "paper": 1000}
 # On a laptop (experiments/pace.md): short iterations, for forgetting takes some hundred whatever their length. Targets
 # would be a few steps in a hundred, less as they are forgotten, so they have more of the uniform starts (the other
 # samplers keep the shares that they are compared for) and clips weigh the same; and what the noise of fast learning
@@ -86,8 +87,9 @@ PACE: dict[str, Any] = {
     "equal_clips": True,
     "anchor": 0.1,
 }
-# A fresh policy learns from what the base would do, which has little noise: many small updates.
+# A fresh policy learns from what the base would do, which has little noise: many small updates, fewer iterations.
 TAUGHT: dict[str, Any] = {"minibatches": 12, "epochs": 4, "anchor": 1.0}
+TAUGHT_ITERATIONS = {"cpu": 200, "paper": 1000}
 
 
 def main(options: Options) -> None:
@@ -147,7 +149,8 @@ def config_of_new_run(options: Options) -> Config:
         sampling = dataclasses.replace(config.sampling, bin_seconds=base.sampling.bin_seconds)
         ppo = dataclasses.replace(config.ppo, **layers)
         config = dataclasses.replace(config, library=base.library, sampling=sampling, ppo=ppo)
-    iterations, start = ITERATIONS[options.preset or "cpu"], find_method(options.method).start
+    start = find_method(options.method).start
+    iterations = (TAUGHT_ITERATIONS if start == "taught" else ITERATIONS)[options.preset or "cpu"]
     if start == "fresh":
         # The base may be an unlearned policy, whose settings held it to its own base.
         config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, anchor=0.0))
