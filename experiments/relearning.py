@@ -82,14 +82,10 @@ def curve_of(
     """
     rows, log = (read_rows(folder / name) for name in ("evaluations.jsonl", "metrics.jsonl"))
     lived = np.diff([0, *(row["environment_steps"] for row in log)]) * [row["target/step_share"] for row in log]
-    until = {row["iteration"]: steps for row, steps in zip(log, np.cumsum(lived), strict=True)}
+    counted = ([0, *(row["iteration"] for row in log)], [0.0, *np.cumsum(lived)])
     start = [] if at_first is None else [(0, _tracking(at_first, targets), 0.0)]
     points = [
-        (
-            row["iteration"],
-            _tracking(row["clips"], targets),
-            float(max((steps for iteration, steps in until.items() if iteration <= row["iteration"]), default=0.0)),
-        )
+        (row["iteration"], _tracking(row["clips"], targets), float(np.interp(row["iteration"], *counted)))
         for row in rows
     ]
     iterations, tracking, steps = zip(*start, *points, strict=True)

@@ -18,6 +18,7 @@ from forgetmimic_jax.options import at_least, parse
 if TYPE_CHECKING:
     from forgetmimic_jax.checkpoint import CheckpointInfo
     from forgetmimic_jax.config import Config
+    from forgetmimic_jax.evaluation.relearning import Lasted
 
 
 @dataclass
@@ -191,19 +192,16 @@ def _control(run: Path, document: Mapping[str, Any]) -> dict[str, Any]:
     return policy
 
 
-def _relearning(path: Path, document: Mapping[str, Any]) -> dict[str, float | None]:
-    """Target transitions until 80 % of the base's tracking, mean over the seeds; None where a seed never got there."""
-    from forgetmimic_jax.evaluation.relearning import crossings
+def _relearning(path: Path, document: Mapping[str, Any]) -> dict[str, tuple[Lasted, Lasted]]:
+    """How long unlearned policy and control took until 80 % of the base's tracking, by the seeds that both have."""
+    from forgetmimic_jax.evaluation.relearning import lasted
 
     try:
         study = json.loads(path.read_text())
         asked, results = study["asked"], study["results"]
         control = "distilled" if "distilled" in results["starts"] else "retrained"
-        found = {}
-        for who, start in (("unlearned", "unlearned"), ("control", control)):
-            reached = crossings(results, start, RELEARNED)
-            steps = [pair[1] for pair in reached if pair]
-            found[who] = sum(steps) / len(steps) if steps and len(steps) == len(reached) else None
+        unlearned, theirs = (lasted(results, start, RELEARNED) for start in ("unlearned", control))
+        found = {seed: (run, theirs[seed]) for seed, run in unlearned.items() if seed in theirs}
     except FileNotFoundError:
         raise InputError(f"{path}: not found") from None
     except (ValueError, KeyError, TypeError, AttributeError) as error:

@@ -23,22 +23,18 @@ def crossing(curve: Mapping[str, list[float]], level: float) -> tuple[float, flo
     return None
 
 
-def crossings(results: Mapping[str, Any], start: str, share: float) -> list[tuple[float, float] | None]:
-    """Of every seed of a start: when it was back at a share of the base's tracking on the same episodes.
+def lasted(results: Mapping[str, Any], start: str, share: float) -> dict[str, Lasted]:
+    """By seed: until a start was back at a share of the base's tracking on the same episodes.
+
+    A run that never was counts with its end, which is too early.
 
     Args:
         results: of the study's JSON.
         start: unlearned, distilled, retrained or fresh.
         share: of the base's survival-weighted tracking on the targets.
     """
-    return [crossing(curve, share * results["base"][seed]) for seed, curve in results["starts"][start].items()]
-
-
-def lasted(results: Mapping[str, Any], start: str, share: float) -> dict[str, Lasted]:
-    """By seed: when it crossed, as `crossings`; a run that never did counts with its end, which is too early."""
     result = {}
-    runs = results["starts"][start].items()
-    for (seed, curve), found in zip(runs, crossings(results, start, share), strict=True):
-        iterations, steps = found or (curve["iterations"][-1], curve["target_steps"][-1])
-        result[seed] = Lasted(iterations, steps, found is not None)
+    for seed, curve in results["starts"][start].items():
+        found = crossing(curve, share * results["base"][seed])
+        result[seed] = Lasted(*(found or (curve["iterations"][-1], curve["target_steps"][-1])), found is not None)
     return result

@@ -143,6 +143,8 @@ def test_comparisons_enter_the_verdict(run, tmp_path):
     for group, mean in (("target", 0.0), ("kept", 1.0)):
         skill = {"mean": mean, "low": mean - 0.1, "high": mean + 0.1, "std": 0.1, "n": 3}
         document["policies"]["unlearned"][group]["skill"] = skill
+    tracking = {"mean": 0.15, "low": 0.12, "high": 0.18, "std": 0.1, "n": 3}
+    document["policies"]["unlearned"]["target"]["survival_weighted_tracking"] = tracking
     (copy / "evaluation.json").write_text(json.dumps(document))
     control = tmp_path / "control"
     control.mkdir()
@@ -287,7 +289,7 @@ def test_comparisons_that_do_not_fit_are_told(refused, run, tmp_path):
     assert told_of_counts(json.dumps(other_targets)) == "targets: found ['nod']; the unlearned run's is ['turn']"
 
 
-def test_a_seed_that_never_relearned_makes_it_never(run, tmp_path):
+def test_relearning_is_compared_by_the_seeds_that_both_have(run, tmp_path):
     def curve(tracking: float, steps: float) -> dict:
         return {"tracking": [tracking] * 2, "target_steps": [steps, 99.0], "iterations": [1, 2]}
 
@@ -297,7 +299,11 @@ def test_a_seed_that_never_relearned_makes_it_never(run, tmp_path):
     results = {"base": {"0": 0.5, "1": 0.5}, "starts": {"unlearned": curves, "retrained": {"0": curves["0"]}}}
     path = tmp_path / "relearning.json"
     path.write_text(json.dumps({"asked": asked, "results": results}))
-    assert report._relearning(path, document) == {"unlearned": None, "control": 10.0}
-    results["starts"]["distilled"] = {"0": curve(0.5, 7.0)}  # as able as the base, so fairer
+    assert report._relearning(path, document) == {"0": ((1, 10.0, True), (1, 10.0, True))}
+    # The distilled control is as able as the base, so fairer.
+    results["starts"]["distilled"] = {"0": curve(0.5, 7.0), "1": curve(0.5, 8.0)}
     path.write_text(json.dumps({"asked": asked, "results": results}))
-    assert report._relearning(path, document)["control"] == 7.0
+    assert report._relearning(path, document) == {
+        "0": ((1, 10.0, True), (1, 7.0, True)),
+        "1": ((2, 99.0, False), (1, 8.0, True)),
+    }

@@ -1,5 +1,6 @@
 import pytest
 
+from forgetmimic_jax.evaluation.relearning import Lasted
 from forgetmimic_jax.evaluation.verdict import CONSISTENT, FAILED, INCONCLUSIVE, RECOVERABLE, RULES, judge
 
 
@@ -20,8 +21,16 @@ def never_lived(low: float, high: float) -> dict:
     return {"target": {"survival_weighted_tracking": interval(low, high)}}
 
 
-SLOW = {"unlearned": 60_000, "control": 100_000}
-FAST = {"unlearned": 40_000, "control": 100_000}
+def relearned(*seeds: tuple[float, float], there: tuple[bool, bool] = (True, True)) -> dict:
+    """Target steps of the unlearned policy and of the control, seed by seed."""
+    return {
+        str(seed): tuple(Lasted(0, steps, reached) for steps, reached in zip(pair, there, strict=True))
+        for seed, pair in enumerate(seeds)
+    }
+
+
+SLOW = relearned((60_000, 100_000))
+FAST = relearned((40_000, 100_000))
 
 
 @pytest.mark.parametrize(
@@ -70,17 +79,21 @@ def test_what_was_not_compared_is_not_consistent():
 @pytest.mark.parametrize(
     ("control", "relearning", "word"),
     [
-        (never_lived(0.15, 0.3), SLOW, CONSISTENT),
-        (never_lived(0.0, 0.1), SLOW, CONSISTENT),  # they touch
-        (never_lived(0.15, 0.3), {"unlearned": 50_000, "control": 100_000}, CONSISTENT),  # half is not less than half
-        (never_lived(0.21, 0.3), SLOW, INCONCLUSIVE),
-        (never_lived(0.0, 0.09), SLOW, INCONCLUSIVE),
-        (never_lived(0.15, 0.3), FAST, RECOVERABLE),
+        (never_lived(0.1, 0.2), SLOW, CONSISTENT),
+        (never_lived(0.12, 0.19), SLOW, CONSISTENT),
+        (never_lived(0.12, 0.21), SLOW, INCONCLUSIVE),  # 0.1 and 0.21 are further apart than 0.1
+        (never_lived(0.09, 0.18), SLOW, INCONCLUSIVE),
+        (never_lived(0.1, 0.2), relearned((50_000, 100_000)), CONSISTENT),  # half is not less than half
+        (never_lived(0.1, 0.2), FAST, RECOVERABLE),
         (never_lived(0.21, 0.3), FAST, RECOVERABLE),
         (None, FAST, RECOVERABLE),
-        (None, {"unlearned": 40_000, "control": None}, RECOVERABLE),
-        (never_lived(0.15, 0.3), {"unlearned": None, "control": 100_000}, INCONCLUSIVE),
-        (never_lived(0.15, 0.3), {"unlearned": None, "control": None}, INCONCLUSIVE),
+        (never_lived(0.1, 0.2), {}, INCONCLUSIVE),
+        (never_lived(0.1, 0.2), SLOW | {"1": FAST["0"]}, INCONCLUSIVE),  # one seed of two
+        (None, relearned((40_000, 100_000), there=(True, False)), RECOVERABLE),  # the control needs even more
+        (never_lived(0.1, 0.2), relearned((60_000, 100_000), there=(True, False)), INCONCLUSIVE),
+        (never_lived(0.1, 0.2), relearned((60_000, 100_000), there=(False, True)), CONSISTENT),  # it needs even more
+        (never_lived(0.1, 0.2), relearned((40_000, 100_000), there=(False, True)), INCONCLUSIVE),
+        (never_lived(0.1, 0.2), relearned((60_000, 100_000), there=(False, False)), INCONCLUSIVE),
     ],
 )
 def test_with_a_control_and_relearning(control, relearning, word):
@@ -93,9 +106,10 @@ def test_a_failure_stays_one_whatever_the_comparisons_say():
 
 
 def test_transitions_are_told_with_the_verdict():
-    told = judge(policies(), relearning={"unlearned": 40_000, "control": None}).reasons[-1]
+    told = judge(policies(), relearning=relearned((40_000, 100_000), (30_000, 90_000), there=(True, False))).reasons[-1]
     assert told == (
-        "It comes back sooner than it can be learned: unlearned after 40,000, control never target transitions."
+        "It comes back sooner than it can be learned: unlearned against control, seed by seed, 40,000 against more "
+        "than 100,000; 30,000 against more than 90,000 target transitions."
     )
 
 
