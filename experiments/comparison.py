@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from experiments.validity import PLAIN
 from forgetmimic_jax.evaluation import paper, statistics
 from forgetmimic_jax.evaluation.tables import markdown_table, number
-from forgetmimic_jax.evaluation.variants import gained, variant_bars, variant_table
+from forgetmimic_jax.evaluation.variants import paired, variant_bars, variant_table
 from forgetmimic_jax.study import Lab, Study, main
 from forgetmimic_jax.sweep import ablation
+from forgetmimic_jax.unlearn import PACE, TAUGHT
 
 CONTROL = "fine-tuned, all clips"
 PAPERS = ("random_reward", "decremental", "trajdeleter")  # baselines that the paper has claims about
@@ -49,22 +50,30 @@ def tell(document: Mapping[str, Any]) -> str:
             f"took {asked['base_environment_steps']:,} environment steps to make the base. *arft* is λ = 16; the rows "
             "by sampler are too, each at the shares of the starts that its rule gives.\n"
         )
+    if "distill" in variants and asked["budget"] == "cpu":
+        steps = {name: of["minibatches"] * of["epochs"] for name, of in (("distill", TAUGHT), ("the others", PACE))}
+        told = ", ".join(f"{name} {count}" for name, count in steps.items())
+        parts.append(f"Gradient steps an iteration: {told}.\n")
     if CONTROL in variants:
-        header = ["", "kept success - base's, points", "- the control's", "kept tracking - base's", "- the control's"]
-        rows = [[label, *differences(variants, label)] for label in variants]
+        header = ["", "kept success - base's, points", "- the control's", "kept tracking / base's", "/ the control's"]
+        rows = [[label, *against_base_and_control(variants, label)] for label in variants]
         parts.append(f"**Kept clips against the base and against the control ({CONTROL})**\n")
         parts.append(markdown_table(header, rows))
     return "\n".join(parts)
 
 
-def differences(variants: Mapping[str, Any], label: str) -> list[str]:
-    """What a variant's kept clips gained on the base's and on the control's of the same seed, over the seeds."""
+def against_base_and_control(variants: Mapping[str, Any], label: str) -> list[str]:
+    """Points of success that kept clips gained on the base's and the control's of the same seed; retained tracking."""
+    kinds: list[tuple[str, Callable[[float, float], float], int]] = [
+        ("success_rate", lambda mine, theirs: 100.0 * (mine - theirs), 1),
+        ("survival_weighted_tracking", lambda mine, theirs: mine / theirs, 3),
+    ]
     cells = []
-    for metric, scale, digits in (("success_rate", 100.0, 1), ("survival_weighted_tracking", 1.0, 3)):
+    for metric, against, digits in kinds:
         for other in (None, CONTROL):
-            found = gained(variants, label, other, "kept", metric)
-            pairs = [scale * value for seed, value in found.items() if seed in variants[CONTROL]["seeds"]]
-            cells.append(number(statistics.over_seeds(pairs), digits) if pairs else "")
+            pairs = paired(variants, label, other, "kept", metric)
+            values = [against(*pair) for seed, pair in pairs.items() if seed in variants[CONTROL]["seeds"]]
+            cells.append(number(statistics.over_seeds(values), digits) if values else "")
     return cells
 
 

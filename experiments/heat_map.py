@@ -92,6 +92,7 @@ STUDY = Study(
     name="heat_map",
     title="Does a long unlearning run wear the kept clips down?",
     iterations={"cpu": 420, "paper": 99_981},
+    watches=True,
     measure=measure,
     tell=tell,
     draw=draw,

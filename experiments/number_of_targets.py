@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from forgetmimic_jax.evaluation import paper
 from forgetmimic_jax.study import Options, main
 from forgetmimic_jax.sweep import targets_study
 
@@ -18,7 +19,7 @@ class H2Options(Options):
     """Robot under robots/."""
 
 
-STUDY = targets_study(GROUPS, name="number_of_targets", title="How many motions at once?")
+STUDY = targets_study(GROUPS, name="number_of_targets", title="How many motions at once?", theirs=paper.H2)
 
 if __name__ == "__main__":
     main(STUDY, H2Options)

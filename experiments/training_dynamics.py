@@ -60,7 +60,12 @@ def tell(document: Mapping[str, Any]) -> str:
         + list(THEIRS.get(name, ("", "")))
         for name in CURVES
     ]
-    note = "R_anti here is a mean over target steps, the paper's over all steps; its numbers are of another library.\n"
+    note = (
+        "R_anti here is a mean over target steps, the paper's over all steps; its numbers are of another library. "
+        "Episode length is of the episodes that ended, and all environments start anew with the run: the first value "
+        "is of those that fell at once. With the cpu budget B gives the targets half of the starts, A leaves them the "
+        "share of its sampler.\n"
+    )
     return f"{markdown_table(header, rows)}\n{note}"
 
 

@@ -89,6 +89,7 @@ class Study:
         iterations: of each trial, by budget.
         asks: what beside the options the answer depends on, such as the values of a sweep.
         retrains: whether a retrained control is among its trials.
+        watches: whether it tells of evaluations on the way, on `watched_episodes`.
     """
 
     name: str
@@ -99,6 +100,7 @@ class Study:
     iterations: Mapping[str, int] = field(default_factory=lambda: ITERATIONS)
     asks: Sequence[str] = ()
     retrains: bool = False
+    watches: bool = False
 
 
 class Lab:
@@ -240,18 +242,15 @@ class Lab:
 
     def watched(self, times: int) -> list[str]:
         """Settings of a trial that is evaluated so often on its way, on half of the study's episodes."""
-        return [f"evaluate_every={max(1, self.iterations // times)}", f"evaluate_episodes={self._watched_episodes}"]
+        episodes = watched_episodes(self.options.episodes)
+        return [f"evaluate_every={max(1, self.iterations // times)}", f"evaluate_episodes={episodes}"]
 
     def as_watched(self, policies: Mapping[K, Path], seed: int) -> dict[K, dict[str, dict[str, float]]]:
         """Policies, clip by clip, on the episodes on which a watched trial of this seed is evaluated."""
         from forgetmimic_jax.evaluation.watch import clip_means
 
-        rolled, names = self.rollouts(policies, episodes=self._watched_episodes, seed=seed)
+        rolled, names = self.rollouts(policies, episodes=watched_episodes(self.options.episodes), seed=seed)
         return {key: clip_means(rollout, names) for key, rollout in rolled.items()}
-
-    @property
-    def _watched_episodes(self) -> int:
-        return max(1, self.options.episodes // 2)
 
     def rollouts(
         self,
@@ -284,6 +283,11 @@ class Lab:
                 rolled[key] = evaluator.rollout(None if path is None else checkpoint.load_policy(path, shapes))
                 report(done, 0, {})
         return rolled, library.names
+
+
+def watched_episodes(episodes: int) -> int:
+    """A clip, in an evaluation on the way: half of the study's."""
+    return max(1, episodes // 2)
 
 
 def newest_policy(folder: Path) -> Path:
@@ -357,12 +361,19 @@ def page(study: Study, document: Mapping[str, Any]) -> str:
     variants = document["results"].get("variants", {}).values()
     own_targets = any("targets" in variant["options"] for variant in variants)
     targets = "" if own_targets else f"; targets {', '.join(asked['targets'])}"
+    episodes = watched_episodes(asked["episodes"]) if study.watches else asked["episodes"]
+    on_laptop = (
+        "- Unlearning with the cpu budget holds the kept clips to the base (an anchor), weighs all clips the same and "
+        "gives the targets half of the starts (`experiments/pace.md`); the paper's has none of it, nor do rows called "
+        "plain PPO."
+    )
     lines = [
         f"# {study.title}",
         "",
         f"- Robot {asked['robot']}; base trained for {asked['base_environment_steps']:,} environment steps{targets}.",
         f"- {asked['iterations']:,} iterations a trial with the {asked['budget']} budget, {asked['seeds']} seed(s), "
-        f"{asked['episodes']} episodes a clip.",
+        f"{episodes} episodes a clip.",
+        *([on_laptop] if asked["budget"] == "cpu" else []),
         "- In square brackets: the 95 % interval over seeds (Student's t); the seed is the unit. One seed has none.",
         *(f"- Failed: `{name}`: {reason}" for name, reason in document["failed"].items()),
         "",

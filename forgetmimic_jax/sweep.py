@@ -62,9 +62,12 @@ def lambda_study(penalties: tuple[str, ...] = PENALTIES, name: str = "lambda") -
 
 
 def targets_study(
-    groups: tuple[str, ...] = GROUPS, name: str = "targets", title: str = "Other motions as targets"
+    groups: tuple[str, ...] = GROUPS,
+    name: str = "targets",
+    title: str = "Other motions as targets",
+    theirs: Mapping[str, Any] | None = None,
 ) -> Study:
-    """Other clips to forget."""
+    """Other clips to forget, beside the paper's numbers where it has them."""
 
     def variants(lab: Lab) -> dict[str, dict[str, Any]]:
         from forgetmimic_jax.runner import check_targets
@@ -81,7 +84,7 @@ def targets_study(
         name,
         title,
         variants,
-        {},
+        theirs or {},
         asks=list(groups),
         draw=lambda document: _draw_targets(document["results"]["variants"]),
     )
@@ -136,8 +139,8 @@ def _tell_lambda(variants: Mapping[str, Any]) -> str:
     if crossed:
         lines.append(
             f"Half of the base's skill on the targets is gone at λ = {number(statistics.over_seeds(crossed), 2)} "
-            f"({len(crossed)} of {seeds} seeds; between two penalties, on a straight line in log λ). That is how "
-            "far this budget gets: a longer run may tip over earlier.\n"
+            f"(mean of the {len(crossed)} of {seeds} seeds in which it went; between two penalties, on a straight line "
+            "in log λ). That is how far this budget gets: a longer run may tip over earlier.\n"
         )
     lines.append(
         f"At most {100 * FORGOTTEN:.0f} % of the base's skill on the targets is left at "

@@ -45,6 +45,42 @@ LAMBDA: dict[str, dict[str, Any]] = {
     )
 }
 
+# Table 'Tracking Reward and Success Rate Comparison on Unitree H2': each clip in the base, and where fight, dance or
+# flips were forgotten.
+_H2_CLIPS = {
+    "dance1": ((0.825, 0.805, 0.681, 0.770), (0.65, 0.60, 0.0, 0.70)),
+    "fallGetUp1": ((0.846, 0.842, 0.831, 0.820), (0.80, 0.50, 0.85, 0.90)),
+    "fight1": ((0.794, 0.654, 0.790, 0.733), (0.55, 0.0, 0.55, 0.85)),
+    "fightSports1": ((0.761, 0.638, 0.767, 0.761), (0.85, 0.0, 0.60, 0.75)),
+    "flip90_1": ((0.880, 0.863, 0.879, 0.631), (0.95, 0.95, 0.95, 0.0)),
+    "flip90_2": ((0.864, 0.877, 0.886, 0.641), (0.70, 0.70, 0.75, 0.0)),
+    "flip90_3": ((0.843, 0.841, 0.851, 0.715), (0.90, 0.80, 1.0, 0.0)),
+    "run1": ((0.777, 0.792, 0.801, 0.759), (0.95, 0.95, 1.0, 1.0)),
+    "sprint1": ((0.832, 0.817, 0.809, 0.783), (0.95, 0.95, 1.0, 0.95)),
+    "walk1": ((0.823, 0.827, 0.838, 0.785), (0.95, 1.0, 1.0, 1.0)),
+}
+_H2_FORGOTTEN = {"dance": (2, ("dance",)), "fight": (1, ("fight",)), "flips": (3, ("flip",))}
+
+
+def _h2(column: int, prefixes: tuple[str, ...]) -> dict[str, dict[str, float]]:
+    """Means over the clips whose name starts so, the targets, and over the others."""
+    clips: dict[str, list[Any]] = {"target": [], "kept": []}
+    for name, numbers in _H2_CLIPS.items():
+        clips["target" if name.startswith(prefixes) else "kept"].append([of[column] for of in numbers])
+    columns = {group: zip(*rows, strict=True) for group, rows in clips.items()}
+    names = ("tracking_reward", "success_rate")
+    return {
+        group: {name: sum(of) / len(of) for name, of in zip(names, both, strict=True)}
+        for group, both in columns.items()
+    }
+
+
+H2 = {
+    label: _h2(place, prefixes)
+    for targets, (column, prefixes) in _H2_FORGOTTEN.items()
+    for label, place in ((f"base ({targets})", 0), (targets, column))
+}
+
 # 'Relearning-based Forgetting Evaluation': iterations until 95 % of the base's tracking reward.
 RELEARNING = {"fight": 4250, "fightAndSports1": 5500, "both": 7500}
 

@@ -36,5 +36,6 @@ def lasted(results: Mapping[str, Any], start: str, share: float) -> dict[str, La
     result = {}
     for seed, curve in results["starts"][start].items():
         found = crossing(curve, share * results["base"][seed])
-        result[seed] = Lasted(*(found or (curve["iterations"][-1], curve["target_steps"][-1])), found is not None)
+        iterations, steps = found or (curve["iterations"][-1], curve["target_steps"][-1])
+        result[seed] = Lasted(iterations, steps, found is not None)
     return result

@@ -12,7 +12,7 @@ import numpy as np
 
 from forgetmimic_jax.errors import InputError, nearest
 from forgetmimic_jax.evaluation import metrics, statistics
-from forgetmimic_jax.evaluation.metrics import BASE, FINE_TUNED, ZERO_ACTION, Rollout
+from forgetmimic_jax.evaluation.metrics import BASE, ZERO_ACTION, Rollout
 from forgetmimic_jax.evaluation.statistics import Estimate
 from forgetmimic_jax.evaluation.tables import markdown, render_table
 
@@ -173,7 +173,4 @@ def _episodes_summary(
             against = (tracking(policy), tracking(BASE), tracking(ZERO_ACTION))
             summary["skill"] = statistics.bootstrap_of_means(metrics.skill, *against, n=n)
     summary["retention"] = statistics.bootstrap_of_means(metrics.ratio, tracking(policy), tracking(BASE), n=n)
-    if FINE_TUNED in per_policy and policy != FINE_TUNED:
-        pair = (tracking(policy), tracking(FINE_TUNED))
-        summary["retention_fine_tuned"] = statistics.bootstrap_of_means(metrics.ratio, *pair, n=n)
     return summary

@@ -24,7 +24,7 @@ from forgetmimic_jax.evaluation import statistics
 from forgetmimic_jax.evaluation.metrics import BASE, FINE_TUNED, UNLEARNED, ZERO_ACTION
 from forgetmimic_jax.evaluation.statistics import Estimate
 
-POLICY_ORDER = (BASE, UNLEARNED, "retrained", FINE_TUNED, "random_init", ZERO_ACTION)
+POLICY_ORDER = (BASE, UNLEARNED, "retrained", FINE_TUNED, ZERO_ACTION)
 
 FORGOTTEN, KEPT = 0.2, 0.8  # a clip is forgotten at most, kept at least, at this share of the base's skill
 WANTED = {"target": "forgotten", "kept": "kept"}
@@ -36,7 +36,6 @@ REWARDS = {
     "success_rate",
     "skill",
     "retention",
-    "retention_fine_tuned",
 }
 UNITS = {
     "episode_length": "steps",

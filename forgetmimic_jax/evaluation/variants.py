@@ -30,11 +30,12 @@ HEADER = ("seeds", "success", "tracking", "while alive", "steps", "skill left")
 NOTES = (
     "tracking: mean tracking reward over the horizon, 0 after a fall (survival-weighted); while alive: the paper's, "
     "over the steps before it.",
+    "base and zero action: one policy each, on the episodes of every seed.",
     "skill left: share of the base's skill above the zero action; ratio: target over kept, of tracking while alive "
     "(the paper's) and of tracking.",
     "a success rate that is the same with every seed has the exact interval of all episodes together.",
-    "Rows of the paper: another library of clips, another base and another budget.",
 )
+THEIRS = "Rows of the paper: another library of clips, another base and another budget."
 
 
 def summary(folder: Path) -> dict[str, Any]:
@@ -64,7 +65,14 @@ def summary(folder: Path) -> dict[str, Any]:
 
 
 def gained(variants: Mapping[str, Any], label: str, other: str | None, group: str, metric: str) -> dict[str, float]:
-    """By seed: a variant's number less another's of the same seed, or less the base's; of the seeds that have both.
+    """By seed: a variant's number less another's; see `paired`."""
+    return {seed: mine - theirs for seed, (mine, theirs) in paired(variants, label, other, group, metric).items()}
+
+
+def paired(
+    variants: Mapping[str, Any], label: str, other: str | None, group: str, metric: str
+) -> dict[str, tuple[float, float]]:
+    """By seed: a variant's number and another's of the same seed, or the base's; of the seeds that have both.
 
     Args:
         variants: of a study's results.
@@ -80,7 +88,7 @@ def gained(variants: Mapping[str, Any], label: str, other: str | None, group: st
         theirs = {seed: run["policy"][group][metric] for seed, run in variants[other]["seeds"].items()}
     else:
         theirs = {seed: run["base"][group][metric] for seed, run in variants[label]["seeds"].items()}
-    return {seed: mine[seed] - theirs[seed] for seed in mine if seed in theirs}
+    return {seed: (mine[seed], theirs[seed]) for seed in mine if seed in theirs}
 
 
 def _means(metrics: Mapping[str, Any]) -> dict[str, float]:
@@ -127,7 +135,8 @@ def variant_table(variants: Mapping[str, Any], theirs: Mapping[str, Any]) -> str
         f"**Targets**\n\n{markdown_table(['', *HEADER], target)}",
         f"**Kept clips**\n\n{markdown_table(['', *HEADER, 'ratio while alive', 'ratio of tracking'], kept)}",
     ]
-    return "\n".join([*tables, *(f"- {note}" for note in NOTES), ""])
+    notes = [*NOTES, THEIRS] if theirs else NOTES
+    return "\n".join([*tables, *(f"- {note}" for note in notes), ""])
 
 
 def _cells(group: Mapping[str, Any]) -> list[str]:

@@ -51,7 +51,9 @@ def test_the_comparisons_claims_by_hand():
     compared = {
         claims.ARFT: variant([0.1, 0.1, 0.1], [0.59, 0.60, 0.61]),
         claims.comparison.CONTROL: variant([0.8, 0.8, 0.8], [0.60, 0.61, 0.62]),
-        "decremental": variant([0.0, 0.0, 0.0], [0.2, 0.21, 0.22]),
+        claims.PLAIN_ARFT: variant([0.2, 0.2, 0.2], [0.4, 0.4, 0.4]),
+        "decremental, plain PPO": variant([0.0, 0.0, 0.0], [0.2, 0.21, 0.22]),
+        "trajdeleter, plain PPO": variant([0.3, 0.31, 0.32], [0.6, 0.5, 0.55]),
         claims.UNIFORM: variant([0.2, 0.2, 0.2], [0.59, 0.60, 0.61]),
         f"{claims.UNIFORM}, wrench": variant([0.3, 0.2, 0.2], [0.6, 0.6, 0.6]),
         claims.ADAPTIVE: variant([0.4, 0.3, 0.2], [0.4, 0.6, 0.5]),
@@ -60,7 +62,9 @@ def test_the_comparisons_claims_by_hand():
     found = {of.claim: of.verdict for of in claims.of_comparison({"results": {"variants": compared}})}
     assert found == {
         "λ = 16: the kept clips are what fine-tuning without an anti-reward gives": "holds",
-        "decremental hurts the kept clips more": "holds",
+        "decremental, plain PPO, hurts the kept clips more than arft": "holds",
+        "trajdeleter, plain PPO, hurts the kept clips more than arft": "does not hold",
+        "trajdeleter, plain PPO, forgets less than arft": "holds",
         "adaptive RSI resists forgetting": "holds",
         "adaptive RSI costs the kept clips": "open",
     }
