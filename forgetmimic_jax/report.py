@@ -312,6 +312,8 @@ def _limits(document: Mapping[str, Any], options: Options) -> list[str]:
         limits.append("Not tested: whether it behaves like a policy that never lived the targets.")
     if options.relearning is None:
         limits.append("Not tested: how fast fine-tuning would bring the targets back.")
+    else:
+        limits.append("Relearning was measured on the study's own unlearned policies, not on this one.")
     if success["mean"] < 0.5:
         limits.append(
             f"The base itself reaches the targets' end in only {percent(success, interval=False)} of the episodes: "

@@ -167,6 +167,7 @@ def test_comparisons_enter_the_verdict(run, tmp_path):
         facts = json.loads((tmp_path / "r.json").read_text())
         assert printed.startswith(f"{facts['verdict']['word']}: ")
         assert not any("never lived" in limit or "bring the" in limit for limit in facts["limits"])
+        assert "Relearning was measured on the study's own unlearned policies, not on this one." in facts["limits"]
         assert facts["commands"][1].endswith(f"--control {control} --relearning {counts}")
         return facts["verdict"]["word"]
 
