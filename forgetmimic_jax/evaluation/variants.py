@@ -128,7 +128,11 @@ def variant_table(variants: Mapping[str, Any], theirs: Mapping[str, Any]) -> str
     policies |= {f"*paper: {label}*": _exact(numbers) for label, numbers in theirs.items()}
     target = [[label, *_cells(policy.get("target", {}))] for label, policy in policies.items()]
     kept = [
-        [label, *_cells(policy.get("kept", {})), *(number(policy.get(ratio), 2) for ratio in RATIOS)]
+        [
+            label,
+            *_cells(policy.get("kept", {})),
+            *(number(within(policy.get(ratio), 0.0, np.inf), 2) for ratio in RATIOS),
+        ]
         for label, policy in policies.items()
     ]
     tables = [
@@ -142,7 +146,7 @@ def variant_table(variants: Mapping[str, Any], theirs: Mapping[str, Any]) -> str
 def _cells(group: Mapping[str, Any]) -> list[str]:
     success, tracking, alive = (within(group.get(metric), 0.0, 1.0) for metric in METRICS[:3])
     n = next((estimate["n"] for estimate in group.values() if estimate["n"]), "")
-    steps = number(group.get("episode_length"), 0)
+    steps = number(within(group.get("episode_length"), 0.0, np.inf), 0)
     return [str(n), percent(success), number(tracking, 2), number(alive, 2), steps, percent(group.get("skill"))]
 
 
