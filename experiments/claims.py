@@ -20,6 +20,7 @@ from experiments import comparison, membership, relearning, validity
 from forgetmimic_jax.errors import InputError, run_command
 from forgetmimic_jax.evaluation import statistics
 from forgetmimic_jax.evaluation import variants as of_variants
+from forgetmimic_jax.evaluation.metrics import ZERO_ACTION
 from forgetmimic_jax.evaluation.relearning import lasted
 from forgetmimic_jax.evaluation.statistics import Estimate
 from forgetmimic_jax.evaluation.tables import FORGOTTEN, markdown_table, number, percent
@@ -32,7 +33,7 @@ README = Path(__file__).parent / "README.md"
 BLOCK = re.compile(r"(<!-- claims:start -->\n).*?(<!-- claims:end -->)", re.DOTALL)
 
 SUCCESS, TRACKING = "success_rate", "survival_weighted_tracking"
-RATIO = "survival_weighted_degradation_ratio"
+LENGTH, RATIO = "episode_length", "survival_weighted_degradation_ratio"
 NONE = 0.05  # of episodes: a success rate below it counts as none
 POINTS = 0.05  # of success that kept clips may lose
 SOONER = 1.0  # steps by which an episode may end before doing nothing would end it
@@ -104,6 +105,12 @@ def of_validity(document: Mapping[str, Any]) -> Iterator[Finding]:
         evidence = f"target over kept tracking {number(within(ratio, 0.0, np.inf), 3)}; {validity.ASKED_RATIO:g} asked"
         claim = f"{label}: the targets' tracking is under a tenth of the kept clips'"
         yield Finding(claim, judged(ratio, validity.ASKED_RATIO), evidence, ratio["n"])
+        runs = variants[label]["seeds"].values()
+        lengths = [(run["policy"]["target"][LENGTH], run[ZERO_ACTION]["target"][LENGTH]) for run in runs]
+        later = statistics.over_seeds([policy - floor for policy, floor in lengths])
+        evidence = f"target episodes last {number(later, 1)} steps on those without a policy of the same seed"
+        claim = f"{label}: short episodes mean a lost skill, and not an episode ended on purpose"
+        yield Finding(claim, judged(later, -SOONER, below=False), evidence, later["n"])
 
 
 def of_comparison(document: Mapping[str, Any]) -> Iterator[Finding]:

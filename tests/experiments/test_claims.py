@@ -47,6 +47,28 @@ def test_differences_are_between_runs_of_the_same_seed():
     assert claims.gained(found, "a", "c", "kept", "success_rate") is None
 
 
+def test_the_default_run_is_held_against_its_control_the_asked_ratio_and_doing_nothing():
+    label, control = (claims.validity.at_length(of) for of in ("λ = 16", claims.validity.CONTROL))
+    found = {label: variant([0.0, 0.0, 0.0], [0.6, 0.6, 0.6]), control: variant([0.8, 0.8, 0.8], [0.67, 0.68, 0.69])}
+    for steps, run in zip((9.0, 9.5, 10.0), found[label]["seeds"].values(), strict=True):
+        run["policy"]["target"]["episode_length"] = steps
+        run["zero_action"] = {"target": {"episode_length": 17.0}}
+    estimates = variants.over_seeds([run["policy"] for run in found[label]["seeds"].values()])
+    ratio = {"survival_weighted_degradation_ratio": over_seeds([0.05, 0.06, 0.07])}
+    found[label]["over_seeds"] = {"policy": {**estimates, **ratio}}
+    told = list(claims.of_validity({"results": {"variants": found}}))
+    assert [(of.claim.removeprefix(f"{label}: "), of.verdict) for of in told] == [
+        ("the targets no longer succeed", "holds"),
+        ("the kept clips stay as they were", "holds"),
+        ("the kept clips are what fine-tuning alone gives", "does not hold"),
+        ("the targets' tracking is under a tenth of the kept clips'", "holds"),
+        ("short episodes mean a lost skill, and not an episode ended on purpose", "does not hold"),
+    ]
+    assert (
+        told[-1].evidence == "target episodes last -7.5 [-8.7, -6.3] steps on those without a policy of the same seed"
+    )
+
+
 def test_the_comparisons_claims_by_hand():
     compared = {
         claims.ARFT: variant([0.1, 0.1, 0.1], [0.59, 0.60, 0.61]),
