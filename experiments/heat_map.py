@@ -9,7 +9,7 @@ import numpy as np
 
 from forgetmimic_jax.evaluation.plots import curve, heat_map, new_figure
 from forgetmimic_jax.evaluation.tables import markdown_table, number
-from forgetmimic_jax.evaluation.variants import over_seeds
+from forgetmimic_jax.evaluation.variants import over_seeds, within
 from forgetmimic_jax.evaluation.watch import SHOWN
 from forgetmimic_jax.rows import read_rows
 from forgetmimic_jax.study import Lab, Study, main
@@ -47,7 +47,7 @@ def tell(document: Mapping[str, Any]) -> str:
     targets = document["asked"]["targets"]
     rows = [
         [clip, "target" if clip in targets else "kept"]
-        + [number(checkpoints[place][clip]["survival_weighted_tracking"], 2) for place in at]
+        + [number(within(checkpoints[place][clip]["survival_weighted_tracking"], 0.0, 1.0), 2) for place in at]
         for clip in sorted(checkpoints[0], key=lambda clip: (clip not in targets, clip))
     ]
     for group in ("target", "kept"):
