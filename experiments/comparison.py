@@ -14,7 +14,7 @@ from forgetmimic_jax.sweep import ablation
 from forgetmimic_jax.unlearn import PACE, TAUGHT
 
 CONTROL = "fine-tuned, all clips"
-PAPERS = ("random_reward", "decremental", "trajdeleter")  # baselines that the paper has claims about
+PAPERS = ("random_reward", "negated_reward", "decremental", "trajdeleter")  # baselines that the paper has claims about
 METHODS: dict[str, dict[str, Any]] = {
     "fine-tuned, kept clips": {"method": "finetune"},
     CONTROL: {"method": "finetune", "clips": "all"},

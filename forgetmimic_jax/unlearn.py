@@ -51,7 +51,7 @@ class Options:
     preset: Literal["cpu", "paper"] | None = None
     """Settings of the fine-tuning; by default the base's own, at the default budget of a laptop."""
     iterations: int | None = None
-    """PPO iterations; 480 by default (1000 with --preset paper), distill: 200,
+    """PPO iterations; 640 by default (1000 with --preset paper), distill: 200,
     retrain: as many steps as the base was trained for."""
     seed: int = 0
     """Random seed of the fine-tuning and of the evaluation."""
@@ -71,7 +71,7 @@ class Options:
     """Any other settings, such as ppo.learning_rate=1e-4."""
 
 
-ITERATIONS = {"cpu": 480, "paper": 1000}
+ITERATIONS = {"cpu": 640, "paper": 1000}
 # On a laptop (experiments/pace.md): short iterations, for forgetting takes some hundred whatever their length. Targets
 # would be a few steps in a hundred, less as they are forgotten, so they have more of the uniform starts (the other
 # samplers keep the shares that they are compared for) and clips weigh the same; and what the noise of fast learning

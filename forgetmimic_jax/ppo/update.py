@@ -109,7 +109,7 @@ def collect(env: Environment, assets: Assets, state: TrainState) -> tuple[TrainS
         fresh = tracking.reset_where(env, assets, after, done, reset_key, probabilities, gains)
         next_actor_obs, next_critic_obs = observe(fresh, observe_key)
         last_critic_obs = tracking.observe(env, assets, after, None)[1]
-        is_target, reward_key = assets.is_target[before.clip], jax.random.fold_in(key, 0)
+        is_target, reward_key = assets.is_target[before.clip], jax.random.fold_in(key, 4)  # none of the four above
         trajectory = Trajectory(
             actor_observation=actor_obs,
             critic_observation=critic_obs,
