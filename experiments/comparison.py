@@ -50,6 +50,11 @@ def tell(document: Mapping[str, Any]) -> str:
             f"took {asked['base_environment_steps']:,} environment steps to make the base. *arft* is λ = 16; the rows "
             "by sampler are too, each at the shares of the starts that its rule gives.\n"
         )
+    if "decremental" in variants and asked["budget"] == "cpu":
+        parts.append(
+            "*decremental* and *policy edit* have losses of their own, without the anchor and the clips' weights; of "
+            "the cpu budget's pace they have the starts, and *plain PPO* takes those away.\n"
+        )
     if "distill" in variants and asked["budget"] == "cpu":
         steps = {name: of["minibatches"] * of["epochs"] for name, of in (("distill", TAUGHT), ("the others", PACE))}
         told = ", ".join(f"{name} {count}" for name, count in steps.items())

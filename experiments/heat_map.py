@@ -56,8 +56,8 @@ def tell(document: Mapping[str, Any]) -> str:
         rows.append([f"mean of {group}", group, *shown])
     header = ["clip", "role", *(f"tracking at {iterations[place]:,}" for place in at)]
     note = (
-        "Paper (another library and budget), tracking while alive: targets 0.86 to 0.52 and 0.61, kept clips 0.855 to "
-        "0.868 after 99,999 iterations.\n"
+        "Paper (another library and budget), tracking while alive: targets from 0.86 to some 0.52-0.61, kept clips "
+        "0.855 to 0.868 after 99,999 iterations.\n"
     )
     return f"{markdown_table(header, rows)}\n{note}"
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from forgetmimic_jax.evaluation import paper
-from forgetmimic_jax.evaluation.membership import attack, features
+from forgetmimic_jax.evaluation.membership import FALSE_POSITIVES, attack, features
 from forgetmimic_jax.evaluation.plots import bars, new_figure
 from forgetmimic_jax.evaluation.tables import markdown_table, number
 from forgetmimic_jax.evaluation.variants import over_seeds, within
@@ -56,29 +56,38 @@ def measure(lab: Lab) -> dict[str, Any]:
     return {"policies": {label: over_seeds(found) for label, found in attacks.items()}}
 
 
-def verdict(estimate: Mapping[str, float]) -> str:
-    """What an AUC over several policies says, in words."""
-    if "low" not in estimate:
+def guessed_hits(asked: Mapping[str, Any]) -> float:
+    """The hits of an attacker who guesses, at the threshold that `attack` takes of so few others."""
+    others = len(asked["targets"]) * asked["episodes"]
+    return (int(FALSE_POSITIVES * others) + 1) / (others + 1)
+
+
+def verdict(of: Mapping[str, Mapping[str, float]], guessed: float) -> str:
+    """What AUC and hits over several policies say, in words; `guessed` are the hits of guessing."""
+    auc, hits = of["auc"], of["tpr_at_5_percent_fpr"]
+    if "low" not in auc:
         return "one policy: no interval, no verdict"
-    if estimate["low"] > 0.5:
+    if auc["low"] > 0.5:
         return "evidence that it was trained on them"
-    if estimate["high"] < 0.5:
+    if auc["high"] < 0.5:
         return "the targets are done worse than their images: marked by having been forgotten"
+    if hits["low"] > guessed:
+        return "the AUC finds no evidence, the hits at 5 % false alarms do"
     return "this probe finds no evidence"
 
 
 def tell(document: Mapping[str, Any]) -> str:
     """The attack on each kind of policy."""
-    policies = document["results"]["policies"]
+    policies, guessed = document["results"]["policies"], guessed_hits(document["asked"])
     rows = [
-        [label, str(of["auc"]["n"]), *(number(within(of[name], 0.0, 1.0), 2) for name in NAMES), verdict(of["auc"])]
+        [label, str(of["auc"]["n"]), *(number(within(of[name], 0.0, 1.0), 2) for name in NAMES), verdict(of, guessed)]
         for label, of in policies.items()
     ]
     rows += [[f"*paper: {label}*", "", f"{value:.2f}", "", "", ""] for label, value in paper.MEMBERSHIP.items()]
     note = (
         "Members are the targets, the others their mirror images, which no policy was trained on; the attacker learned "
-        "from the kept clips and their images. Guessing is 0.5, 0.5 and 0.05. Intervals are over policies; the verdict "
-        "is the AUC's alone, and a TPR above 0.05 may say more. The "
+        "from the kept clips and their images. Guessing is 0.5, 0.5 and "
+        f"{guessed:.2f}, more than 0.05 because the others are few. Intervals are over policies. The "
         f"retrained one has had {document['asked']['control_iterations']:,} iterations. This is probe evidence: it "
         "certifies nothing. The paper's attack is another, on another library.\n"
     )

@@ -11,6 +11,7 @@ import numpy as np
 from forgetmimic_jax.evaluation import metrics, statistics
 from forgetmimic_jax.evaluation.plots import new_figure
 from forgetmimic_jax.evaluation.tables import UNITS, markdown_table, number
+from forgetmimic_jax.evaluation.variants import within
 from forgetmimic_jax.study import Lab, Study, main, newest_policy
 
 if TYPE_CHECKING:
@@ -56,7 +57,10 @@ def tell(document: Mapping[str, Any]) -> str:
         plain = name.removesuffix(metrics.COMMON)
         label = f"{plain.replace('_', ' ')}, {UNITS.get(plain, 'm')}{', common steps' if common else ''}"
         cells = [statistics.over_seeds([np.mean(run[name]) for run in of.values()]) for of in policies.values()]
-        rows.append([label, *(number(cell, 1 if name == "episode_length" else 3) for cell in cells)])
+        digits, largest = (
+            (1, np.inf) if name == "episode_length" else (3, 1.0 if UNITS.get(plain) == "share" else np.inf)
+        )
+        rows.append([label, *(number(within(cell, 0.0, largest), digits) for cell in cells)])
     note = (
         "On the targets. Errors over the steps alive flatter a policy that falls at once; common steps are those that "
         "every policy survives. Paper (another library and budget): length 500 to 8-13 steps, anchor position error "

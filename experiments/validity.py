@@ -48,7 +48,8 @@ def tell(document: Mapping[str, Any]) -> str:
         f"A ratio of tracking of {ASKED_RATIO} would need {ASKED_RATIO * kept['mean']:.2f} on the targets beside the "
         f"{number(kept, 2)} that {label} keeps. The robot without a policy gets {number(floor, 2)} there, for it takes "
         "a while to fall: further down, a policy does not lack a skill but ends its episodes sooner than doing nothing "
-        "would.\n"
+        "would.\n\nThe paper's rows are of its text, which for both penalties also has 3-4 steps on the targets, a "
+        "kept tracking of 0.85-0.86 and a kept success above 85 %; its table of methods says 68 and 72 %.\n"
     )
     return f"{variant_table(variants, paper.VALIDITY)}\n{note}"
 

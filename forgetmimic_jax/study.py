@@ -165,6 +165,7 @@ class Lab:
             "seeds": len(self.seeds),
             "episodes": self.options.episodes,
             "set": list(itertools.chain(*self.options.set)),
+            **({"physics": self.options.physics} if self.options.physics else {}),
         }
 
     def trial(self, variant: Mapping[str, Any]) -> Trial:

@@ -20,7 +20,7 @@ FALSE_POSITIVES = 0.05
 
 @dataclass(frozen=True)
 class Attack:
-    """How well members are told from their never-trained twins; 0.5, 0.5 and 0.05 is guessing."""
+    """How well members are told from their never-trained twins; guessing is 0.5, 0.5 and, of many others, 0.05."""
 
     accuracy: float
     auc: float

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from forgetmimic_jax.evaluation import statistics
-from forgetmimic_jax.evaluation.metrics import BASE, ZERO_ACTION
+from forgetmimic_jax.evaluation.metrics import BASE, COMMON, ZERO_ACTION
 from forgetmimic_jax.evaluation.plots import bars, new_figure
 from forgetmimic_jax.evaluation.tables import markdown_table, number, percent
 from forgetmimic_jax.rows import read_rows
@@ -21,7 +21,11 @@ from forgetmimic_jax.rows import read_rows
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-METRICS = ("success_rate", "survival_weighted_tracking", "tracking_reward", "episode_length", "skill", "retention")
+DEVIATION = f"max_key_body_position_error{COMMON}"  # m
+METRICS = (
+    *("success_rate", "survival_weighted_tracking", "tracking_reward", "episode_length", "skill", "retention"),
+    DEVIATION,
+)
 EPISODES = "episodes"  # of the group, behind its success rate
 RATIOS = ("degradation_ratio", "survival_weighted_degradation_ratio")
 

@@ -19,7 +19,7 @@ from forgetmimic_jax.ppo.loss import Batch, Prediction, mean, ppo_loss
 from forgetmimic_jax.tracking.reward import Reward
 from forgetmimic_jax.unlearning.method import Method, plain_reward
 
-BLOCKS = 32  # of the forgetting phase, as many on what is kept as on the targets
+BLOCKS = 32  # of the forgetting phase, give or take its last ones: a block is a whole number of iterations
 FORGETTING, DISTANCE = 0.8, 0.1
 
 

@@ -368,6 +368,16 @@ def test_what_a_method_shows_the_actor_is_what_it_acts_on(run, trajectory):
     assert np.abs(found.mean[first][:, on_target] - trajectory.mean[first][:, on_target]).max() > 1e-4
 
 
+def test_a_random_reward_is_drawn_apart_from_the_actions(run):
+    """Both are monotone in the random bits they are made of, so the same bits would show as the same order."""
+    env = with_method(run, "random_reward")
+    assets = dataclasses.replace(run.assets, is_target=jnp.ones_like(run.assets.is_target))
+    found = jax.device_get(jax.jit(lambda assets, state: collect(env, assets, state))(assets, run.start())[1])
+    noise = (found.action - found.mean).reshape(len(found.reward), -1)[:, :ENVS]
+    assert all(np.ptp(rewards) > 0 for rewards in found.reward)
+    assert not any((rewards.argsort() == of.argsort()).all() for rewards, of in zip(found.reward, noise, strict=True))
+
+
 def test_an_iteration_without_a_simulator_moves_no_robot_and_only_the_actor_learns(run):
     env = with_method(run, "policy_edit")
     env = dataclasses.replace(env, engine=None)

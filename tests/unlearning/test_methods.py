@@ -137,9 +137,9 @@ def test_gradient_ascent_turns_the_advantage_of_target_steps_round(batch):
 
 def test_decremental_by_hand(batch):
     # σ0 = 1 in the paper's settings; both groups count the same, joints are summed
-    forget = JOINTS * gaussian_kl(0.25, 0.5, 0.0, 1.0) + 1.0**2
-    keep = JOINTS * gaussian_kl(0.25, 0.5, 0.5, 0.5) + (1.0 - 3.0) ** 2
-    assert loss_of("decremental", batch, now()) == pytest.approx(forget + keep, rel=1e-5)
+    forget = JOINTS * gaussian_kl(0.25, 0.4, 0.0, 1.0) + 1.0**2
+    keep = JOINTS * gaussian_kl(0.25, 0.4, 0.5, 0.5) + (1.0 - 3.0) ** 2
+    assert loss_of("decremental", batch, now(std=0.4)) == pytest.approx(forget + keep, rel=1e-5)
 
 
 def test_decremental_is_content_with_nothing_on_targets_and_the_base_on_kept_steps(batch):
@@ -179,6 +179,20 @@ def test_policy_edit_is_content_with_its_random_action_on_targets_and_the_base_o
     assert (jnp.abs(random_action) > 0.01).all()
     assert float(loss_at(random_action)) == pytest.approx(0.0, abs=1e-5)
     assert float(loss_at(random_action + 0.5)) == pytest.approx(JOINTS * 0.5**2 / (2 * 0.5**2), rel=1e-4)
+
+
+def test_policy_edit_by_hand_where_the_spread_is_not_the_base_s(batch):
+    """Both divergences are of the policy from where it is to go, with the base's σ of 0.5: at another σ they differ."""
+
+    def loss_at(mean: float, std: float) -> float:
+        means = jnp.concatenate([jnp.full((2, JOINTS), mean), jnp.full((2, JOINTS), 0.5)])
+        prediction = Prediction(means, jnp.full(JOINTS, jnp.log(std)), jnp.zeros(4))
+        return float(find_method("policy_edit").loss(CONFIG, batch, prediction, jnp.int32(0))[0])
+
+    spread = JOINTS * (gaussian_kl(0.5, 0.4, 0.5, 0.5) - gaussian_kl(0.5, 0.5, 0.5, 0.5))
+    # the means' share of the divergence is over 2 σ_base² whatever the policy's σ, so σ alone changes both by this
+    for mean in (0.0, 0.7):
+        assert loss_at(mean, 0.4) - loss_at(mean, 0.5) == pytest.approx(2 * spread, rel=1e-4)
 
 
 def test_policy_edit_draws_another_action_for_another_clip_and_seed(batch):
