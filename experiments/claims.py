@@ -22,7 +22,7 @@ from forgetmimic_jax.errors import InputError, run_command
 from forgetmimic_jax.evaluation import statistics
 from forgetmimic_jax.evaluation import variants as of_variants
 from forgetmimic_jax.evaluation.metrics import ZERO_ACTION
-from forgetmimic_jax.evaluation.relearning import lasted
+from forgetmimic_jax.evaluation.relearning import at_first, lasted
 from forgetmimic_jax.evaluation.statistics import Estimate
 from forgetmimic_jax.evaluation.tables import FORGOTTEN, markdown_table, number, percent
 from forgetmimic_jax.evaluation.variants import DEVIATION, within
@@ -262,7 +262,7 @@ def of_training_dynamics(document: Mapping[str, Any]) -> Iterator[Finding]:
 
 def difference(last: Estimate, first: Estimate) -> Estimate:
     """Of two estimates whose seeds are no longer known one by one: as wide as both intervals together."""
-    result = {"mean": last["mean"] - first["mean"], "n": last["n"]}
+    result: Estimate = {"mean": last["mean"] - first["mean"], "n": last["n"]}
     if "low" in last and "low" in first:
         result |= {"low": last["low"] - first["high"], "high": last["high"] - first["low"]}
     return result
@@ -287,19 +287,13 @@ def of_relearning(document: Mapping[str, Any]) -> Iterator[Finding]:
             verdict = "open"
         mean = float(np.mean([theirs[seed].target_steps for seed in both]))
         evidence = f"{number(sooner, 0)} target steps more than the {mean:,.0f} of the {control} one of the same seed"
-        at_first = [share_at_first(results, control, seed) for seed in both]
-        if np.mean(at_first) >= HEAD_START * share:
-            verdict, evidence = "the control starts near it", f"{evidence}, which starts at {np.mean(at_first):.0%}"
+        head_start = float(np.mean([at_first(results, control).get(seed, 0.0) for seed in both]))
+        if head_start >= HEAD_START * share:
+            verdict, evidence = "the control starts near it", f"{evidence}, which starts at {head_start:.0%}"
         ends = [f"{label} in {count} of {len(both)} runs" for label, count in never.items() if count]
         if ends:
             evidence += f"; not reached, counted with the run's end: {' and '.join(ends)}"
         yield Finding(claim, verdict, evidence, sooner["n"])
-
-
-def share_at_first(results: Mapping[str, Any], start: str, seed: str) -> float:
-    """Of the base's tracking on the targets, what a start has before it relearns; a fresh policy has nothing."""
-    curve = results["starts"][start][seed]
-    return curve["tracking"][0] / results["base"][seed] if curve["iterations"][0] == 0 else 0.0
 
 
 def of_membership(document: Mapping[str, Any]) -> Iterator[Finding]:

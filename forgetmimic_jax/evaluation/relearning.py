@@ -39,3 +39,13 @@ def lasted(results: Mapping[str, Any], start: str, share: float) -> dict[str, La
         iterations, steps = found or (curve["iterations"][-1], curve["target_steps"][-1])
         result[seed] = Lasted(iterations, steps, found is not None)
     return result
+
+
+def at_first(results: Mapping[str, Any], start: str) -> dict[str, float]:
+    """By seed: of the base's tracking on the targets, what a start has before it relearns.
+
+    Without the seeds whose start was not evaluated, as those of a fresh policy.
+    """
+    curves = results["starts"][start]
+    before = {seed: curve["tracking"][0] for seed, curve in curves.items() if curve["iterations"][0] == 0}
+    return {seed: tracking / results["base"][seed] for seed, tracking in before.items()}
