@@ -37,6 +37,7 @@ SUCCESS, TRACKING = "success_rate", "survival_weighted_tracking"
 LENGTH, RATIO = "episode_length", "survival_weighted_degradation_ratio"
 NONE = 0.05  # of episodes: a success rate below it counts as none
 POINTS = 0.05  # of success that kept clips may lose
+NO_FURTHER_OFF = "while it stands it is no further off a target than the robot without a policy"
 SOONER = 1.0  # steps by which an episode may end before doing nothing would end it
 CONTROLS = ("distilled", "retrained", "fresh")  # never lived a target: what relearning is compared with
 HEAD_START = 0.8  # of a level: a control that starts above that says little of how fast it is reached
@@ -122,7 +123,7 @@ def of_validity(document: Mapping[str, Any]) -> Iterator[Finding]:
         ]
         if off:
             further = statistics.over_seeds([policy - floor for policy, floor in off])
-            claim = f"{label}: while it stands it is no further off a target than the robot without a policy"
+            claim = f"{label}: {NO_FURTHER_OFF}"
             without = np.mean([floor for _, floor in off])
             evidence = (
                 f"largest key body error {number(further, 3)} m more than the {without:.3f} m without a policy, "
@@ -227,12 +228,7 @@ def of_physical_behaviour(document: Mapping[str, Any]) -> Iterator[Finding]:
     kinds = (
         ("the feet are less on the floor than the base's", "foot_contact", "base", True),
         ("joints are more often beyond their limits than the base's", "joint_limit_violation", "base", False),
-        (
-            "while it stands it is no further off a target than the robot without a policy",
-            DEVIATION,
-            "zero action",
-            True,
-        ),
+        (NO_FURTHER_OFF, DEVIATION, "zero action", True),
     )
     for claim, name, other, below in kinds:
         if all(name in run for run in policies.get(label, {"": {}}).values()):

@@ -57,9 +57,8 @@ def tell(document: Mapping[str, Any]) -> str:
         plain = name.removesuffix(metrics.COMMON)
         label = f"{plain.replace('_', ' ')}, {UNITS.get(plain, 'm')}{', common steps' if common else ''}"
         cells = [statistics.over_seeds([np.mean(run[name]) for run in of.values()]) for of in policies.values()]
-        digits, largest = (
-            (1, np.inf) if name == "episode_length" else (3, 1.0 if UNITS.get(plain) == "share" else np.inf)
-        )
+        largest = 1.0 if UNITS.get(plain) == "share" else np.inf
+        digits = 1 if name == "episode_length" else 3
         rows.append([label, *(number(within(cell, 0.0, largest), digits) for cell in cells)])
     note = (
         "On the targets. Errors over the steps alive flatter a policy that falls at once; common steps are those that "
