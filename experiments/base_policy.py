@@ -9,10 +9,10 @@ from typing import Any
 import matplotlib
 import numpy as np
 
+from forgetmimic_jax.basics.files import read_rows
 from forgetmimic_jax.motion import quality
 from forgetmimic_jax.motion.library import DATA_DIR, read_library, read_manifest
-from forgetmimic_jax.robot import load_robot
-from forgetmimic_jax.rows import read_rows
+from forgetmimic_jax.robot.model import load_robot
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 
 from experiments import comparison, membership, relearning, validity
-from forgetmimic_jax.errors import InputError, run_command
+from forgetmimic_jax.basics.errors import InputError, run_command
+from forgetmimic_jax.basics.files import write_atomically
 from forgetmimic_jax.evaluation import statistics
 from forgetmimic_jax.evaluation import variants as of_variants
 from forgetmimic_jax.evaluation.metrics import ZERO_ACTION
@@ -26,8 +27,7 @@ from forgetmimic_jax.evaluation.relearning import at_first, lasted
 from forgetmimic_jax.evaluation.statistics import Estimate
 from forgetmimic_jax.evaluation.tables import FORGOTTEN, markdown_table, number, percent
 from forgetmimic_jax.evaluation.variants import DEVIATION, within
-from forgetmimic_jax.motion.clip import write_atomically
-from forgetmimic_jax.study import RESULTS
+from forgetmimic_jax.studies.study import RESULTS
 from forgetmimic_jax.sweep import half_gone_by_seed
 
 README = Path(__file__).parent / "README.md"

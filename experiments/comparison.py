@@ -9,7 +9,7 @@ from experiments.validity import PLAIN
 from forgetmimic_jax.evaluation import paper, statistics
 from forgetmimic_jax.evaluation.tables import markdown_table, number
 from forgetmimic_jax.evaluation.variants import paired, variant_bars, variant_table
-from forgetmimic_jax.study import Lab, Study, main
+from forgetmimic_jax.studies.study import Lab, Study, main
 from forgetmimic_jax.sweep import ablation
 from forgetmimic_jax.unlearn import PACE, TAUGHT
 

@@ -18,7 +18,7 @@ import numpy as np
 import tyro
 
 from experiments.feasibility import RESULT, straight_lines
-from forgetmimic_jax.errors import InputError, nearest, run_command
+from forgetmimic_jax.basics.errors import InputError, nearest, run_command
 
 ENVIRONMENTS, STEPS, EPISODE = 512, 24, 80  # a round's, and at most of an episode
 EPOCHS, MINIBATCHES, LEARNING_RATE = 4, 24, 3e-4  # the step size falls to 0 over the second half
@@ -72,14 +72,14 @@ def distill(options: Options) -> None:
     import jax.numpy as jnp
     import optax
 
-    from forgetmimic_jax import checkpoint, runner
-    from forgetmimic_jax.config import UnlearnConfig
-    from forgetmimic_jax.console import closing, progress
+    from forgetmimic_jax.basics.console import closing, progress
     from forgetmimic_jax.evaluation.rollout import act
-    from forgetmimic_jax.ppo import network
-    from forgetmimic_jax.ppo.network import normalize
-    from forgetmimic_jax.state import init_state, make_actor, make_critic
+    from forgetmimic_jax.policy import network
+    from forgetmimic_jax.policy.network import normalize
+    from forgetmimic_jax.ppo.state import init_state, make_actor, make_critic
+    from forgetmimic_jax.settings.config import UnlearnConfig
     from forgetmimic_jax.tracking import env as tracking
+    from forgetmimic_jax.training import checkpoint, runner
 
     if options.output.exists():
         raise InputError(f"{options.output}: exists already; choose another, or remove it")

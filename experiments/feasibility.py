@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from forgetmimic_jax.study import measured_page, named_policy
+from forgetmimic_jax.studies.study import measured_page, named_policy
 
 HERE = Path(__file__).parent
 RESULT = HERE / "results" / "feasibility.json"
@@ -66,9 +66,9 @@ def measure(checkpoint_path: Path) -> dict:
     import jax
     import jax.numpy as jnp
 
-    from forgetmimic_jax import checkpoint, runner
     from forgetmimic_jax.evaluation.rollout import Evaluator, act, begin_episodes, evaluation_config
     from forgetmimic_jax.tracking import env as tracking
+    from forgetmimic_jax.training import checkpoint, runner
 
     info = checkpoint.read_info(checkpoint_path)
     config = dataclasses.replace(info.config, base=None)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from forgetmimic_jax.study import measured_page, named_policy
+from forgetmimic_jax.studies.study import measured_page, named_policy
 
 HERE = Path(__file__).parent
 RESULT = HERE / "results" / "gradient_noise.json"
@@ -69,11 +69,11 @@ def measure(checkpoint_path: Path) -> dict:
     import jax.flatten_util
     import jax.numpy as jnp
 
-    from forgetmimic_jax import checkpoint, runner
-    from forgetmimic_jax.ppo import network
+    from forgetmimic_jax.policy import network
     from forgetmimic_jax.ppo.gae import centre_branches, generalized_advantages
+    from forgetmimic_jax.ppo.state import make_actor
     from forgetmimic_jax.ppo.update import collect
-    from forgetmimic_jax.state import make_actor
+    from forgetmimic_jax.training import checkpoint, runner
 
     info = checkpoint.read_info(checkpoint_path)
     ppo = dataclasses.replace(info.config.ppo, num_envs=ENVIRONMENTS, num_steps=STEPS, branches=BRANCHES, minibatches=1)

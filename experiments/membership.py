@@ -14,7 +14,7 @@ from forgetmimic_jax.evaluation.membership import FALSE_POSITIVES, attack, featu
 from forgetmimic_jax.evaluation.plots import bars, new_figure
 from forgetmimic_jax.evaluation.tables import markdown_table, number
 from forgetmimic_jax.evaluation.variants import over_seeds, within
-from forgetmimic_jax.study import Lab, Study, main, newest_policy
+from forgetmimic_jax.studies.study import Lab, Study, main, newest_policy
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -26,8 +26,8 @@ def measure(lab: Lab) -> dict[str, Any]:
     """Every policy on the clips and on their mirror images, and the attack on the targets."""
     from forgetmimic_jax.motion.clip import read_clip
     from forgetmimic_jax.motion.mirror import mirrored
-    from forgetmimic_jax.robot import load_robot
-    from forgetmimic_jax.runner import library_folder
+    from forgetmimic_jax.robot.model import load_robot
+    from forgetmimic_jax.training.runner import library_folder
 
     runs = lab.run(
         {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from forgetmimic_jax.study import main
+from forgetmimic_jax.studies.study import main
 from forgetmimic_jax.sweep import targets_study
 
 STUDY = targets_study(name="motion_types")

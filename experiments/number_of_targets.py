@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from forgetmimic_jax.evaluation import paper
-from forgetmimic_jax.study import Options, main
+from forgetmimic_jax.studies.study import Options, main
 from forgetmimic_jax.sweep import targets_study
 
 GROUPS = ("dance_a", "punch,kick", "jump,spinkick,cartwheel")  # dance, combat and acrobatics, as in the paper

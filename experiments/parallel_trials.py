@@ -14,7 +14,7 @@ import sys
 import time
 from pathlib import Path
 
-from forgetmimic_jax.study import measured_page
+from forgetmimic_jax.studies.study import measured_page
 
 HERE = Path(__file__).parent
 RESULT = HERE / "results" / "parallel_trials.json"
@@ -43,8 +43,9 @@ def train(members: int) -> float:
     import jax
     import jax.numpy as jnp
 
-    from forgetmimic_jax import runner, unlearn
+    from forgetmimic_jax import unlearn
     from forgetmimic_jax.ppo.update import make_iteration
+    from forgetmimic_jax.training import runner
 
     config = unlearn.config_of_new_run(unlearn.Options())
     setup = runner.with_base(runner.make_setup(config))

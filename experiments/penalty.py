@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from forgetmimic_jax.study import main
+from forgetmimic_jax.studies.study import main
 from forgetmimic_jax.sweep import lambda_study
 
 STUDY = lambda_study(name="penalty")

@@ -12,7 +12,7 @@ from forgetmimic_jax.evaluation import metrics, statistics
 from forgetmimic_jax.evaluation.plots import new_figure
 from forgetmimic_jax.evaluation.tables import UNITS, markdown_table, number
 from forgetmimic_jax.evaluation.variants import within
-from forgetmimic_jax.study import Lab, Study, main, newest_policy
+from forgetmimic_jax.studies.study import Lab, Study, main, newest_policy
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

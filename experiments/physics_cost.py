@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from forgetmimic_jax.study import measured_page
+from forgetmimic_jax.studies.study import measured_page
 
 HERE = Path(__file__).parent
 RESULT = HERE / "results" / "physics_cost.json"
@@ -51,9 +51,9 @@ def measure() -> dict:
     import mujoco
     import mujoco.batch
 
-    from forgetmimic_jax import checkpoint, runner
     from forgetmimic_jax.evaluation.rollout import act, begin_episodes, evaluation_config
     from forgetmimic_jax.tracking import env as tracking
+    from forgetmimic_jax.training import checkpoint, runner
 
     base = runner.base_folder("g1")
     config = evaluation_config(checkpoint.read_info(base).config)

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from forgetmimic_jax.basics.files import read_rows
 from forgetmimic_jax.evaluation import paper, statistics
 from forgetmimic_jax.evaluation.plots import new_figure
 from forgetmimic_jax.evaluation.relearning import at_first, lasted
 from forgetmimic_jax.evaluation.tables import markdown_table, number, percent
 from forgetmimic_jax.evaluation.variants import within
-from forgetmimic_jax.rows import read_rows
-from forgetmimic_jax.study import ITERATIONS, Lab, Study, main, newest_policy
+from forgetmimic_jax.studies.study import ITERATIONS, Lab, Study, main, newest_policy
 from forgetmimic_jax.unlearn import PACE, TARGET_SHARE
 
 if TYPE_CHECKING:

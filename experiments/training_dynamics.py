@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from forgetmimic_jax.basics.files import read_rows
 from forgetmimic_jax.evaluation.plots import new_figure
 from forgetmimic_jax.evaluation.tables import markdown_table, number
 from forgetmimic_jax.evaluation.variants import over_seeds
-from forgetmimic_jax.rows import read_rows
-from forgetmimic_jax.study import Lab, Study, main
+from forgetmimic_jax.studies.study import Lab, Study, main
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -9,7 +9,7 @@ from forgetmimic_jax.evaluation import paper
 from forgetmimic_jax.evaluation.metrics import ZERO_ACTION
 from forgetmimic_jax.evaluation.tables import number
 from forgetmimic_jax.evaluation.variants import variant_table
-from forgetmimic_jax.study import Lab, main, variants_study
+from forgetmimic_jax.studies.study import Lab, main, variants_study
 from forgetmimic_jax.unlearn import ITERATIONS
 
 ASKED_RATIO = 0.1  # of tracking, target over kept

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from forgetmimic_jax.errors import InputError, run_command
-from forgetmimic_jax.options import at_least, on_engine, parse, replace_given
+from forgetmimic_jax.basics.errors import InputError, run_command
+from forgetmimic_jax.settings.options import at_least, on_engine, parse, replace_given
 
 
 @dataclass
@@ -43,12 +43,12 @@ def main(options: Options) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from forgetmimic_jax import runner
-    from forgetmimic_jax.config import preset
     from forgetmimic_jax.physics.engine import resolve_engine
     from forgetmimic_jax.ppo.update import collect, make_iteration
+    from forgetmimic_jax.settings.config import preset
     from forgetmimic_jax.tracking import env as tracking
     from forgetmimic_jax.tracking.rsi import bin_probabilities
+    from forgetmimic_jax.training import runner
 
     at_least(1, "--repeats", options.repeats)
     if options.output:

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from forgetmimic_jax.errors import run_command
-from forgetmimic_jax.options import at_least, comma_separated, parse
+from forgetmimic_jax.basics.errors import run_command
+from forgetmimic_jax.settings.options import at_least, comma_separated, parse
 
 
 @dataclass
@@ -36,10 +36,10 @@ class Options:
 
 def main(options: Options) -> None:
     """Evaluate, write the files and print the table."""
-    from forgetmimic_jax import runner
-    from forgetmimic_jax.comparison import load_comparison
-    from forgetmimic_jax.console import closing
+    from forgetmimic_jax.basics.console import closing
     from forgetmimic_jax.evaluation.evaluate import cost, evaluate, show_and_write
+    from forgetmimic_jax.training import runner
+    from forgetmimic_jax.training.comparison import load_comparison
 
     at_least(1, "--episodes", options.episodes)
     at_least(0, "--seed", options.seed)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from forgetmimic_jax.errors import InputError, run_command
-from forgetmimic_jax.options import at_least, on_engine, parse, replace_given
+from forgetmimic_jax.basics.errors import InputError, run_command
+from forgetmimic_jax.settings.options import at_least, on_engine, parse, replace_given
 
 if TYPE_CHECKING:
     from forgetmimic_jax.evaluation.metrics import Rollout
@@ -46,13 +46,13 @@ def main(options: Options) -> None:
     import numpy as np
     from rich.console import Console
 
-    from forgetmimic_jax import checkpoint, runner
-    from forgetmimic_jax.console import closing, progress
+    from forgetmimic_jax.basics.console import closing, progress
+    from forgetmimic_jax.basics.files import write_atomically
     from forgetmimic_jax.evaluation.rollout import Evaluator
     from forgetmimic_jax.exchange.closed_loop import run_episodes
     from forgetmimic_jax.exchange.onnx_actor import OnnxActor, to_onnx
-    from forgetmimic_jax.motion.clip import write_atomically
-    from forgetmimic_jax.state import mean_action
+    from forgetmimic_jax.ppo.state import mean_action
+    from forgetmimic_jax.training import checkpoint, runner
 
     at_least(1, "--episodes", options.episodes)
     at_least(0, "--seed", options.seed)

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from forgetmimic_jax.console import closing
-from forgetmimic_jax.errors import InputError, run_command
-from forgetmimic_jax.options import comma_separated, parse
+from forgetmimic_jax.basics.console import closing
+from forgetmimic_jax.basics.errors import InputError, run_command
+from forgetmimic_jax.settings.options import comma_separated, parse
 
 if TYPE_CHECKING:
     from forgetmimic_jax.motion.clip import Clip
     from forgetmimic_jax.motion.quality import Quality
-    from forgetmimic_jax.robot import Robot
+    from forgetmimic_jax.robot.model import Robot
 
 FPS = 50.0  # of every library: the control rate
 
@@ -122,7 +122,7 @@ def main(options: Options) -> None:
     """Run one of the commands."""
     # Before NumPy starts: its threads only stand in each other's way on matrices as small as a robot's.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from forgetmimic_jax.robot import load_robot
+    from forgetmimic_jax.robot.model import load_robot
 
     robot = load_robot(options.robot)
     match options.command:
@@ -176,8 +176,8 @@ def import_motion(robot: Robot, options: Import) -> None:
 
 def retarget(robot: Robot, options: Retarget) -> None:
     """Make the shipped library again."""
-    from forgetmimic_jax.motion import recipe
     from forgetmimic_jax.motion.library import DATA_DIR, MANIFEST, read_manifest
+    from forgetmimic_jax.retarget import recipe
 
     if options.output.is_dir() and any(options.output.iterdir()):
         if not (options.output / MANIFEST).exists():

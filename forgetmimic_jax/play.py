@@ -6,8 +6,8 @@ import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 
-from forgetmimic_jax.errors import InputError, run_command
-from forgetmimic_jax.options import at_least, parse
+from forgetmimic_jax.basics.errors import InputError, run_command
+from forgetmimic_jax.settings.options import at_least, parse
 
 
 @dataclass
@@ -35,8 +35,8 @@ def main(options: Options) -> None:
     """Serve the page until Ctrl-C."""
     from rich.console import Console
 
-    from forgetmimic_jax import runner
-    from forgetmimic_jax.comparison import load_comparison
+    from forgetmimic_jax.training import runner
+    from forgetmimic_jax.training.comparison import load_comparison
     from forgetmimic_jax.viewing.page import Page
     from forgetmimic_jax.viewing.playback import Playback
     from forgetmimic_jax.viewing.side_by_side import SideBySide

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from forgetmimic_jax.errors import InputError, run_command
-from forgetmimic_jax.options import at_least, parse
+from forgetmimic_jax.basics.errors import InputError, run_command
+from forgetmimic_jax.settings.options import at_least, parse
 
 if TYPE_CHECKING:
-    from forgetmimic_jax.checkpoint import CheckpointInfo
-    from forgetmimic_jax.config import Config
     from forgetmimic_jax.evaluation.relearning import Lasted
+    from forgetmimic_jax.settings.config import Config
+    from forgetmimic_jax.training.checkpoint import CheckpointInfo
 
 
 @dataclass
@@ -53,12 +53,11 @@ def main(options: Options) -> None:
     from markupsafe import Markup
     from rich.console import Console
 
-    from forgetmimic_jax import checkpoint, runner
-    from forgetmimic_jax.console import closing
+    from forgetmimic_jax.basics.console import closing
+    from forgetmimic_jax.basics.files import read_rows, write_atomically
     from forgetmimic_jax.evaluation import plots, tables
     from forgetmimic_jax.evaluation.verdict import RULES, judge
-    from forgetmimic_jax.motion.clip import write_atomically
-    from forgetmimic_jax.rows import read_rows
+    from forgetmimic_jax.training import checkpoint, runner
 
     at_least(0, "--films", options.films)
     output = options.output or options.run / "report.html"
@@ -158,7 +157,7 @@ def _checkpoint(run: Path, document: Mapping[str, Any]) -> Path:
 
 def _base(options: Options, document: Mapping[str, Any], info: CheckpointInfo) -> CheckpointInfo:
     """The base that was evaluated; a shipped one may have been replaced since."""
-    from forgetmimic_jax import checkpoint, runner
+    from forgetmimic_jax.training import checkpoint, runner
 
     base = checkpoint.read_info(options.base or runner.base_checkpoint(info.config))
     evaluated = document.get("budget", {}).get("base", {}).get("environment_steps", base.environment_steps)
@@ -172,7 +171,7 @@ def _base(options: Options, document: Mapping[str, Any], info: CheckpointInfo) -
 
 def _control(run: Path, document: Mapping[str, Any]) -> dict[str, Any]:
     """The policy of another run that never lived the targets, measured on the same episodes."""
-    from forgetmimic_jax.config import load_config
+    from forgetmimic_jax.settings.config import load_config
     from forgetmimic_jax.unlearning.registry import method_of
 
     path = run / "evaluation.json"
@@ -325,7 +324,7 @@ def _limits(document: Mapping[str, Any], options: Options) -> list[str]:
 def _commands(options: Options, document: Mapping[str, Any], info: CheckpointInfo) -> list[str]:
     """What makes the run, and this page, again."""
     from forgetmimic_jax import unlearn
-    from forgetmimic_jax.config import to_dict
+    from forgetmimic_jax.settings.config import to_dict
 
     config = info.config
     flags: dict[str, Any] = {
@@ -371,7 +370,7 @@ def _identity(document: Mapping[str, Any], info: CheckpointInfo, base: Checkpoin
     """Which files and programs these are."""
     from importlib.metadata import version
 
-    from forgetmimic_jax.checkpoint import policy_hash
+    from forgetmimic_jax.training.checkpoint import policy_hash
 
     programs = ", ".join(f"{package} {version(package)}" for package in PACKAGES)
     return {
@@ -387,8 +386,8 @@ def _films(
     options: Options, document: Mapping[str, Any], info: CheckpointInfo, base: CheckpointInfo
 ) -> tuple[list[dict[str, str]], str]:
     """Films and their posters as base64 with captions, and why there are none or fewer."""
-    from forgetmimic_jax.comparison import load_comparison
-    from forgetmimic_jax.console import progress
+    from forgetmimic_jax.basics.console import progress
+    from forgetmimic_jax.training.comparison import load_comparison
     from forgetmimic_jax.viewing import film
     from forgetmimic_jax.viewing.offscreen import check_rendering
     from forgetmimic_jax.viewing.side_by_side import record

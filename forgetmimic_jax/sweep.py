@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from forgetmimic_jax.errors import InputError, run_command
+from forgetmimic_jax.basics.errors import InputError, run_command
 from forgetmimic_jax.evaluation import paper, statistics
 from forgetmimic_jax.evaluation.metrics import BASE
 from forgetmimic_jax.evaluation.plots import curve, heat_map, new_figure
 from forgetmimic_jax.evaluation.tables import FORGOTTEN, number
 from forgetmimic_jax.evaluation.variants import variant_table
-from forgetmimic_jax.options import comma_separated, parse
-from forgetmimic_jax.study import ITERATIONS, Lab, Study, conduct, variants_study
-from forgetmimic_jax.study import Options as StudyOptions
+from forgetmimic_jax.settings.options import comma_separated, parse
+from forgetmimic_jax.studies.study import ITERATIONS, Lab, Study, conduct, variants_study
+from forgetmimic_jax.studies.study import Options as StudyOptions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -70,7 +70,7 @@ def targets_study(
     """Other clips to forget, beside the paper's numbers where it has them."""
 
     def variants(lab: Lab) -> dict[str, dict[str, Any]]:
-        from forgetmimic_jax.runner import check_targets
+        from forgetmimic_jax.training.runner import check_targets
 
         asked = [comma_separated(group) for group in groups]
         if groups == GROUPS:  # as far as the robot's library has them

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from forgetmimic_jax.errors import run_command
-from forgetmimic_jax.options import Settings, check_same, on_engine, override, parse, replace_given
+from forgetmimic_jax.basics.errors import run_command
+from forgetmimic_jax.settings.options import Settings, check_same, on_engine, override, parse, replace_given
 
 
 @dataclass
@@ -39,9 +39,9 @@ class Options:
 
 def main(options: Options) -> None:
     """Train, and say where the checkpoint is."""
-    from forgetmimic_jax import runner
-    from forgetmimic_jax.config import load_config, preset
-    from forgetmimic_jax.console import closing
+    from forgetmimic_jax.basics.console import closing
+    from forgetmimic_jax.settings.config import load_config, preset
+    from forgetmimic_jax.training import runner
 
     output = options.output or Path("runs") / f"train-{options.robot}"
     runner.prepare_folder(output, resume=options.resume)

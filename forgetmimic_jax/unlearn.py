@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from forgetmimic_jax.config import Config, UnlearnConfig, WrenchConfig, load_config, preset
-from forgetmimic_jax.errors import InputError, run_command
-from forgetmimic_jax.options import (
+from forgetmimic_jax.basics.errors import InputError, run_command
+from forgetmimic_jax.settings.config import Config, UnlearnConfig, WrenchConfig, load_config, preset
+from forgetmimic_jax.settings.options import (
     Settings,
     at_least,
     check_same,
@@ -94,9 +94,9 @@ TAUGHT_ITERATIONS = {"cpu": 200, "paper": 1000}
 
 def main(options: Options) -> None:
     """Unlearn, evaluate base, new policy and zero action, and print what was forgotten and what was kept."""
-    from forgetmimic_jax import checkpoint, runner
-    from forgetmimic_jax.console import closing
+    from forgetmimic_jax.basics.console import closing
     from forgetmimic_jax.evaluation.evaluate import cost, evaluate, show_and_write
+    from forgetmimic_jax.training import checkpoint, runner
     from forgetmimic_jax.unlearning.registry import method_of
 
     at_least(1, "--episodes", options.episodes)
@@ -137,7 +137,7 @@ def main(options: Options) -> None:
 
 def config_of_new_run(options: Options) -> Config:
     """The base's settings, or the preset's, as the method and the flags change them."""
-    from forgetmimic_jax import checkpoint, runner
+    from forgetmimic_jax.training import checkpoint, runner
     from forgetmimic_jax.unlearning.registry import find_method, unlearning_config
 
     info = checkpoint.read_info(options.base or runner.base_folder(options.robot))

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from forgetmimic_jax.errors import InputError, nearest, run_command
-from forgetmimic_jax.options import at_least, comma_separated, parse
+from forgetmimic_jax.basics.errors import InputError, nearest, run_command
+from forgetmimic_jax.settings.options import at_least, comma_separated, parse
 
 if TYPE_CHECKING:
     from forgetmimic_jax.viewing.side_by_side import Episode
@@ -45,10 +45,10 @@ def main(options: Options) -> None:
     """Record the episodes, draw and write the films, and print how the policies did in them."""
     from rich.console import Console
 
-    from forgetmimic_jax import runner
-    from forgetmimic_jax.comparison import load_comparison
-    from forgetmimic_jax.console import closing, progress
-    from forgetmimic_jax.motion.clip import write_atomically
+    from forgetmimic_jax.basics.console import closing, progress
+    from forgetmimic_jax.basics.files import write_atomically
+    from forgetmimic_jax.training import runner
+    from forgetmimic_jax.training.comparison import load_comparison
     from forgetmimic_jax.viewing import film
     from forgetmimic_jax.viewing.offscreen import check_rendering
     from forgetmimic_jax.viewing.side_by_side import record

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from forgetmimic_jax.config import Config, preset
 from forgetmimic_jax.motion.clip import Clip, write_clip
 from forgetmimic_jax.motion.library import MotionLibrary, build_library, file_hash, write_manifest
-from forgetmimic_jax.robot import Robot, load_robot
+from forgetmimic_jax.robot.model import Robot, load_robot
+from forgetmimic_jax.settings.config import Config, preset
 
 # Compiling is most of what the tests wait for; this makes it three times as fast. JAX reads it when it first starts.
 os.environ["XLA_FLAGS"] += " --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"

@@ -6,15 +6,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from forgetmimic_jax.checkpoint import CheckpointInfo
-from forgetmimic_jax.config import Config, config_hash
-from forgetmimic_jax.console import progress
+from forgetmimic_jax.basics.console import progress
 from forgetmimic_jax.evaluation.metrics import ZERO_ACTION
 from forgetmimic_jax.evaluation.report import evaluate_policies, evaluation_document, write_evaluation
 from forgetmimic_jax.evaluation.rollout import Evaluator
 from forgetmimic_jax.motion.library import MotionLibrary
-from forgetmimic_jax.robot import Robot
-from forgetmimic_jax.state import Policy
+from forgetmimic_jax.ppo.state import Policy
+from forgetmimic_jax.robot.model import Robot
+from forgetmimic_jax.settings.config import Config, config_hash
+from forgetmimic_jax.training.checkpoint import CheckpointInfo
 
 EPISODES = 20  # a clip
 

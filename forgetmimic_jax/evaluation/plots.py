@@ -9,10 +9,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.basics.errors import InputError
+from forgetmimic_jax.basics.files import read_rows
 from forgetmimic_jax.evaluation.statistics import Estimate
 from forgetmimic_jax.evaluation.tables import clip_order, policy_order
-from forgetmimic_jax.rows import read_rows
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from forgetmimic_jax.errors import InputError, nearest
+from forgetmimic_jax.basics.errors import InputError, nearest
 from forgetmimic_jax.evaluation import metrics, statistics
 from forgetmimic_jax.evaluation.metrics import BASE, ZERO_ACTION, Rollout
 from forgetmimic_jax.evaluation.statistics import Estimate

@@ -12,12 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from forgetmimic_jax import rotation
-from forgetmimic_jax.config import Config
+from forgetmimic_jax.basics import rotation
 from forgetmimic_jax.evaluation.metrics import Rollout
 from forgetmimic_jax.motion.library import MotionLibrary
-from forgetmimic_jax.robot import Robot
-from forgetmimic_jax.state import Policy, mean_action
+from forgetmimic_jax.ppo.state import Policy, mean_action
+from forgetmimic_jax.robot.model import Robot
+from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.tracking.env import Assets, Environment, EnvState, StepResult
 from forgetmimic_jax.tracking.reference import align_to_anchor

@@ -19,7 +19,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from forgetmimic_jax.errors import InputError, run_command
+from forgetmimic_jax.basics.errors import InputError, run_command
 from forgetmimic_jax.evaluation import statistics
 from forgetmimic_jax.evaluation.metrics import BASE, FINE_TUNED, UNLEARNED, ZERO_ACTION
 from forgetmimic_jax.evaluation.statistics import Estimate

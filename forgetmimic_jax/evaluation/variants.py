@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from forgetmimic_jax.basics.files import read_rows
 from forgetmimic_jax.evaluation import statistics
 from forgetmimic_jax.evaluation.metrics import BASE, COMMON, ZERO_ACTION
 from forgetmimic_jax.evaluation.plots import bars, new_figure
 from forgetmimic_jax.evaluation.tables import markdown_table, number, percent
-from forgetmimic_jax.rows import read_rows
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

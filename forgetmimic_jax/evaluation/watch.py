@@ -7,14 +7,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from forgetmimic_jax.config import Config
+from forgetmimic_jax.basics.files import drop_rows_after, read_rows
 from forgetmimic_jax.evaluation.metrics import Rollout, episode_metrics
 from forgetmimic_jax.evaluation.plots import clips_over_time
 from forgetmimic_jax.evaluation.rollout import Evaluator
 from forgetmimic_jax.motion.library import MotionLibrary
-from forgetmimic_jax.robot import Robot
-from forgetmimic_jax.rows import drop_rows_after, read_rows
-from forgetmimic_jax.state import Policy
+from forgetmimic_jax.ppo.state import Policy
+from forgetmimic_jax.robot.model import Robot
+from forgetmimic_jax.settings.config import Config
 
 FILE = "evaluations.jsonl"
 SHOWN = ("success_rate", "survival_weighted_tracking", "tracking_reward")

@@ -14,13 +14,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from forgetmimic_jax.config import Config
 from forgetmimic_jax.evaluation.metrics import Rollout
 from forgetmimic_jax.exchange.onnx_actor import OnnxActor
 from forgetmimic_jax.motion.library import MotionLibrary
 from forgetmimic_jax.physics import BodyState
 from forgetmimic_jax.physics.engine import contact_sensor_columns
-from forgetmimic_jax.robot import Robot
+from forgetmimic_jax.robot.model import Robot
+from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking import reward
 from forgetmimic_jax.tracking.env import EnvState
 from forgetmimic_jax.tracking.reference import align_to_anchor, lookup

@@ -10,10 +10,10 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from forgetmimic_jax.errors import InputError
-from forgetmimic_jax.ppo.network import MAX_STD, MIN_STD, OBSERVATION_LIMIT, VARIANCE_FLOOR, Normalizer
-from forgetmimic_jax.robot import Robot
-from forgetmimic_jax.state import Policy
+from forgetmimic_jax.basics.errors import InputError
+from forgetmimic_jax.policy.network import MAX_STD, MIN_STD, OBSERVATION_LIMIT, VARIANCE_FLOOR, Normalizer
+from forgetmimic_jax.ppo.state import Policy
+from forgetmimic_jax.robot.model import Robot
 from forgetmimic_jax.tracking.observation import actor_layout
 
 UNKNOWN_COUNT = 1e8  # observations behind statistics that do not say it: as many as the running ones ever remember

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.exchange.imported import UNKNOWN_COUNT, ImportedActor
 from forgetmimic_jax.motion.readers import NumbersOnly, Refused
 

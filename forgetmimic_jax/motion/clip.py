@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import io
-import os
-import tempfile
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.basics.errors import InputError
+from forgetmimic_jax.basics.files import write_atomically
 
 FIELDS = ("fps", "joint_names", "root_pos", "root_quat", "joint_pos")
 # Coarser than the last bits that differ between machines' linear algebra, so that a clip regenerates bit for bit;
@@ -79,21 +78,6 @@ def rounded(clip: Clip) -> Clip:
     return Clip(
         clip.name, float(clip.fps), clip.joint_names, cut(clip.root_pos), cut(clip.root_quat), cut(clip.joint_pos)
     )
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file so that a reader, or a crash, sees the old content or the new, never a part."""
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
 
 
 def write_clip(clip: Clip, path: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from forgetmimic_jax.motion.deepmimic import CHEST_HEIGHT, HumanPose
 from forgetmimic_jax.motion.kinematics import rate
-from forgetmimic_jax.robot import Robot
+from forgetmimic_jax.robot.model import Robot
 
 SIDES = ("left", "right")
 # A recorded sole in stance drifts up to 5 cm off the floor and creeps; between the two values the weight falls to 0.

@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw
 
 from forgetmimic_jax.motion.clip import Clip
 from forgetmimic_jax.motion.kinematics import configuration
-from forgetmimic_jax.robot import Robot, relative_height
+from forgetmimic_jax.robot.model import Robot, relative_height
 
 WIDTH, HEIGHT, CAPTION = 132, 160, 16  # pixels of one frame, and of the line above a strip
 PIXELS_PER_M = 88.0  # for a robot of the G1's height

@@ -12,7 +12,7 @@ from scipy.optimize import nnls
 
 from forgetmimic_jax.motion.least_squares import Term
 from forgetmimic_jax.motion.timeline import Timeline, cross_matrix
-from forgetmimic_jax.robot import Robot
+from forgetmimic_jax.robot.model import Robot
 
 RADIUS = 0.3  # m, over which a moment counts as a force
 FRICTION = 0.7

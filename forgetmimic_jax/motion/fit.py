@@ -6,11 +6,11 @@ import dataclasses
 
 import numpy as np
 
-from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.motion.clip import Clip
 from forgetmimic_jax.motion.contact import floor_points, floor_positions
 from forgetmimic_jax.motion.kinematics import configuration, resample
-from forgetmimic_jax.robot import Robot
+from forgetmimic_jax.robot.model import Robot
 
 MAX_SINK = 0.015  # m
 

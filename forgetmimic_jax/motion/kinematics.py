@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from forgetmimic_jax.motion.clip import Clip, continuous
-from forgetmimic_jax.robot import Robot
+from forgetmimic_jax.robot.model import Robot
 
 
 def rotation(quat: np.ndarray) -> Rotation:

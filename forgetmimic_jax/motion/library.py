@@ -17,10 +17,11 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from forgetmimic_jax.errors import InputError, nearest
-from forgetmimic_jax.motion.clip import Clip, read_clip, write_atomically, write_clip
+from forgetmimic_jax.basics.errors import InputError, nearest
+from forgetmimic_jax.basics.files import write_atomically
+from forgetmimic_jax.motion.clip import Clip, read_clip, write_clip
 from forgetmimic_jax.motion.kinematics import body_motion, configuration, rate, resample
-from forgetmimic_jax.robot import Robot
+from forgetmimic_jax.robot.model import Robot
 
 DATA_DIR = Path(__file__).resolve().parents[2] / "data"
 MANIFEST = "manifest.json"

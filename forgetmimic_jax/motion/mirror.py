@@ -6,9 +6,9 @@ import dataclasses
 
 import numpy as np
 
-from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.motion.clip import Clip
-from forgetmimic_jax.robot import Robot
+from forgetmimic_jax.robot.model import Robot
 
 PSEUDOVECTOR = np.array([-1.0, 1.0, -1.0])  # what a reflection of y does to an axis of rotation
 

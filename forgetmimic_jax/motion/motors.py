@@ -17,7 +17,7 @@ from forgetmimic_jax.motion.contact import FloorPoints
 from forgetmimic_jax.motion.dynamics import PYRAMID, RADIUS, TOUCHING
 from forgetmimic_jax.motion.least_squares import Term
 from forgetmimic_jax.motion.timeline import Timeline
-from forgetmimic_jax.robot import Robot
+from forgetmimic_jax.robot.model import Robot
 
 BALANCE = 20.0  # motors' torque limits that a missing root force of the robot's weight counts as
 SURE = 1.0  # torque limits: beyond it a lack counts linearly, so that an impact does not bend the motion

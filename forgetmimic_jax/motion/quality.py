@@ -13,7 +13,7 @@ from forgetmimic_jax.motion.contact import SIDES, FloorPoints, floor_points, flo
 from forgetmimic_jax.motion.dynamics import missing_acceleration
 from forgetmimic_jax.motion.kinematics import configuration, rate
 from forgetmimic_jax.motion.motors import motor_loads
-from forgetmimic_jax.robot import Robot
+from forgetmimic_jax.robot.model import Robot
 
 STANCE_HEIGHT = 0.05  # m: a foot this low …
 STANCE_SPEED = 0.3  # m/s: … and this slow stands

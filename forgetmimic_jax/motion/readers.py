@@ -16,11 +16,11 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.motion.clip import Clip, validated
 from forgetmimic_jax.motion.contact import floor_points, floor_positions
 from forgetmimic_jax.motion.kinematics import configuration
-from forgetmimic_jax.robot import Robot
+from forgetmimic_jax.robot.model import Robot
 
 BODY_DISTANCE = 0.1  # m between a file's body and the robot's: more, and the joints are in another order
 MISPLACED = 0.12  # m that the robot's lowest point lies from the floor on average: more calls for a doubt

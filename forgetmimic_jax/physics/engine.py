@@ -13,9 +13,9 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from forgetmimic_jax import rotation
-from forgetmimic_jax.config import PhysicsConfig
-from forgetmimic_jax.robot import CONTACT_SENSOR, Robot
+from forgetmimic_jax.basics import rotation
+from forgetmimic_jax.robot.model import CONTACT_SENSOR, Robot
+from forgetmimic_jax.settings.config import PhysicsConfig
 
 
 @struct.dataclass

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from jax import Array
 
-from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.physics.engine import (
     BodyState,
     PhysicsParameters,
@@ -21,7 +21,7 @@ from forgetmimic_jax.physics.engine import (
     contact_sensor_columns,
     select_rows,
 )
-from forgetmimic_jax.robot import Robot
+from forgetmimic_jax.robot.model import Robot
 
 with contextlib.redirect_stdout(io.StringIO()):  # without warp, the import prints that it is missing
     import mujoco.mjx.warp

@@ -20,7 +20,7 @@ from forgetmimic_jax.physics.engine import (
     contact_sensor_columns,
     select_rows,
 )
-from forgetmimic_jax.robot import Robot
+from forgetmimic_jax.robot.model import Robot
 
 _VELOCITY_STAGE = int(mujoco.mjtStage.mjSTAGE_VEL)
 

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from forgetmimic_jax.config import Config, PPOConfig
-from forgetmimic_jax.ppo.network import entropy, kl_divergence, log_prob
+from forgetmimic_jax.policy.network import entropy, kl_divergence, log_prob
+from forgetmimic_jax.settings.config import Config, PPOConfig
 
 WARM_UP = 0.05  # of a run
 

@@ -14,12 +14,12 @@ import optax
 from flax import struct
 from jax import Array
 
-from forgetmimic_jax.config import PPOConfig
-from forgetmimic_jax.ppo import network
+from forgetmimic_jax.policy import network
+from forgetmimic_jax.policy.network import bound_std, kl_divergence, log_prob, normalize, update_normalizer
 from forgetmimic_jax.ppo.gae import centre_branches, generalized_advantages
 from forgetmimic_jax.ppo.loss import Batch, Prediction, adapt_learning_rate, equal_share, trapezoid
-from forgetmimic_jax.ppo.network import bound_std, kl_divergence, log_prob, normalize, update_normalizer
-from forgetmimic_jax.state import Policy, TrainState, make_actor, make_critic, make_optimizer
+from forgetmimic_jax.ppo.state import Policy, TrainState, make_actor, make_critic, make_optimizer
+from forgetmimic_jax.settings.config import PPOConfig
 from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.tracking.env import Assets, Environment
 from forgetmimic_jax.tracking.rsi import bin_probabilities, episode_failure, sample_start, update_failure_level

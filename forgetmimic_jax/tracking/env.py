@@ -16,10 +16,10 @@ import mujoco
 from flax import struct
 from jax import Array
 
-from forgetmimic_jax.config import Config
 from forgetmimic_jax.motion.library import MotionLibrary
 from forgetmimic_jax.physics import BodyState, Engine, PhysicsParameters, PhysicsState, make_engine
-from forgetmimic_jax.robot import Robot, RobotArrays
+from forgetmimic_jax.robot.model import Robot, RobotArrays
+from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking import observation, randomise, reward
 from forgetmimic_jax.tracking.reference import Reference, align_to_anchor, lookup
 from forgetmimic_jax.tracking.rsi import Bins, make_bins, sample_start

@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from forgetmimic_jax import rotation
-from forgetmimic_jax.config import NoiseConfig
+from forgetmimic_jax.basics import rotation
 from forgetmimic_jax.physics import PhysicsParameters, PhysicsState
-from forgetmimic_jax.robot import RobotArrays
+from forgetmimic_jax.robot.model import RobotArrays
+from forgetmimic_jax.settings.config import NoiseConfig
 from forgetmimic_jax.tracking.reference import Reference
 
 

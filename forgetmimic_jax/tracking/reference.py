@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from forgetmimic_jax import rotation
+from forgetmimic_jax.basics import rotation
 from forgetmimic_jax.motion.library import MotionLibrary
 
 

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from forgetmimic_jax import rotation
-from forgetmimic_jax.config import RewardConfig
+from forgetmimic_jax.basics import rotation
 from forgetmimic_jax.physics import BodyState
-from forgetmimic_jax.robot import RobotArrays
+from forgetmimic_jax.robot.model import RobotArrays
+from forgetmimic_jax.settings.config import RewardConfig
 from forgetmimic_jax.tracking.reference import AlignedBodies, Reference
 
 # (κ, σ) of every tracking term; its weight is the field of the same name in RewardConfig.

@@ -11,8 +11,8 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from forgetmimic_jax.config import SamplingConfig
 from forgetmimic_jax.motion.library import MotionLibrary
+from forgetmimic_jax.settings.config import SamplingConfig
 
 
 @struct.dataclass

@@ -8,8 +8,8 @@ from typing import Literal
 
 from jax import Array
 
-from forgetmimic_jax.config import Config
 from forgetmimic_jax.ppo.loss import Batch, Prediction, ppo_loss
+from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking.reward import Reward
 
 

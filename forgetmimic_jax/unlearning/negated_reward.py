@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from jax import Array
 
-from forgetmimic_jax.config import Config
+from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking.reward import Reward
 from forgetmimic_jax.unlearning.method import Method, plain_reward
 

@@ -11,9 +11,9 @@ from __future__ import annotations
 import jax
 from jax import Array
 
-from forgetmimic_jax.config import Config
+from forgetmimic_jax.policy.network import entropy, kl_divergence
 from forgetmimic_jax.ppo.loss import Batch, Prediction, mean
-from forgetmimic_jax.ppo.network import entropy, kl_divergence
+from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.unlearning.method import Method
 
 

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from forgetmimic_jax.config import Config
+from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking.reward import Reward, total_tracking_weight
 from forgetmimic_jax.unlearning.method import Method, plain_reward
 

@@ -7,8 +7,8 @@ import importlib
 import pkgutil
 
 from forgetmimic_jax import unlearning
-from forgetmimic_jax.config import Config, UnlearnConfig
-from forgetmimic_jax.errors import InputError, nearest
+from forgetmimic_jax.basics.errors import InputError, nearest
+from forgetmimic_jax.settings.config import Config, UnlearnConfig
 from forgetmimic_jax.unlearning.method import Method
 
 

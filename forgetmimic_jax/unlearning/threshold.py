@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import Array
 
-from forgetmimic_jax.config import Config
+from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking.reward import total_tracking_weight
 
 

@@ -14,8 +14,8 @@ import dataclasses
 import jax.numpy as jnp
 from jax import Array
 
-from forgetmimic_jax.config import Config
 from forgetmimic_jax.ppo.loss import Batch, Prediction, mean, ppo_loss
+from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking.reward import Reward
 from forgetmimic_jax.unlearning.method import Method, plain_reward
 

@@ -13,8 +13,8 @@ from types import TracebackType
 import mujoco
 import numpy as np
 
-from forgetmimic_jax.errors import InputError
-from forgetmimic_jax.robot import VISUAL_GROUP, read_spec, relative_height
+from forgetmimic_jax.basics.errors import InputError
+from forgetmimic_jax.robot.model import VISUAL_GROUP, read_spec, relative_height
 
 # Distances are for a robot of the G1's height; for another those of this file scale.
 GHOST_ALPHA = 0.2

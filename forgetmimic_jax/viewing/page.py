@@ -14,7 +14,7 @@ import numpy.typing as npt
 import viser
 from scipy.spatial.transform import Rotation
 
-from forgetmimic_jax.robot import Robot, relative_height
+from forgetmimic_jax.robot.model import Robot, relative_height
 from forgetmimic_jax.viewing.offscreen import drawing_model
 from forgetmimic_jax.viewing.playback import Playback
 from forgetmimic_jax.viewing.shapes import UNIT_MESHES, Shapes, shapes

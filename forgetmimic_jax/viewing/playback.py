@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from forgetmimic_jax.robot import Robot
+from forgetmimic_jax.robot.model import Robot
 from forgetmimic_jax.viewing.side_by_side import SideBySide, push, reference_qpos
 
 AFTER_END_SECONDS = 2.0  # lived on once every policy's episode has ended

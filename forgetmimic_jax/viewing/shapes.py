@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from forgetmimic_jax.robot import VISUAL_GROUP
+from forgetmimic_jax.robot.model import VISUAL_GROUP
 
 # Of half-size one along every axis; a capsule is a cylinder with two balls.
 UNIT_MESHES = {

@@ -14,11 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from forgetmimic_jax.config import Config
 from forgetmimic_jax.evaluation.rollout import act, begin_episodes, evaluation_config
 from forgetmimic_jax.motion.library import MotionLibrary
-from forgetmimic_jax.robot import Robot
-from forgetmimic_jax.state import Policy
+from forgetmimic_jax.ppo.state import Policy
+from forgetmimic_jax.robot.model import Robot
+from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.tracking.env import Assets, EnvState, StepResult
 

@@ -8,8 +8,9 @@ from typing import Any
 import pytest
 from miniature import TINY, Run, finished
 
-from forgetmimic_jax import runner, train, unlearn
-from forgetmimic_jax.errors import run_command
+from forgetmimic_jax import train, unlearn
+from forgetmimic_jax.basics.errors import run_command
+from forgetmimic_jax.training import runner
 
 
 @pytest.fixture(scope="session", autouse=True)

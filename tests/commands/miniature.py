@@ -8,8 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from forgetmimic_jax import checkpoint, runner
-from forgetmimic_jax.state import TrainState
+from forgetmimic_jax.ppo.state import TrainState
+from forgetmimic_jax.training import checkpoint, runner
 
 # The assistive wrench is on, so that unlearning has something to turn off.
 TINY = [

@@ -4,9 +4,11 @@ from pathlib import Path
 import pytest
 from miniature import TINY, finished
 
-from forgetmimic_jax import bench, config, runner
-from forgetmimic_jax.options import override
+from forgetmimic_jax import bench
 from forgetmimic_jax.ppo import update
+from forgetmimic_jax.settings import config
+from forgetmimic_jax.settings.options import override
+from forgetmimic_jax.training import runner
 
 
 @pytest.fixture

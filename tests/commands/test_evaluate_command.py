@@ -6,10 +6,10 @@ import pytest
 from miniature import finished
 
 from forgetmimic_jax import evaluate
-from forgetmimic_jax.checkpoint import policy_hash, read_info
-from forgetmimic_jax.comparison import load_comparison
-from forgetmimic_jax.options import on_engine, parse
 from forgetmimic_jax.physics.engine import resolve_engine
+from forgetmimic_jax.settings.options import on_engine, parse
+from forgetmimic_jax.training.checkpoint import policy_hash, read_info
+from forgetmimic_jax.training.comparison import load_comparison
 
 
 @pytest.fixture
@@ -100,7 +100,7 @@ def test_a_damaged_policy_is_told(refused, options, base_run, tmp_path):
 
 
 def test_mjx_is_accepted(base_run):
-    from forgetmimic_jax.checkpoint import read_info
+    from forgetmimic_jax.training.checkpoint import read_info
 
     options = parse(evaluate.Options, "evaluate", ["--physics", "mjx"])
     config = on_engine(read_info(base_run.checkpoint(4)).config, options.physics)

@@ -7,8 +7,8 @@ import pytest
 from miniature import finished
 
 from forgetmimic_jax import export
-from forgetmimic_jax.checkpoint import policy_hash, read_info
 from forgetmimic_jax.exchange import onnx_actor
+from forgetmimic_jax.training.checkpoint import policy_hash, read_info
 
 
 @pytest.fixture

@@ -4,9 +4,9 @@ import re
 
 import pytest
 
-from forgetmimic_jax.options import parse
+from forgetmimic_jax.settings.options import parse
 
-COMMANDS = ["train", "unlearn", "evaluate", "bench", "export", "importers", "play", "report", "video"]
+COMMANDS = ["train", "unlearn", "evaluate", "bench", "export", "import_policy", "play", "report", "video"]
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -13,11 +13,11 @@ from miniature import finished
 from PIL import Image
 
 from forgetmimic_jax import report, unlearn
-from forgetmimic_jax.checkpoint import policy_hash, read_info
-from forgetmimic_jax.config import load_config
-from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.evaluation.verdict import RULES
-from forgetmimic_jax.options import override, parse
+from forgetmimic_jax.settings.config import load_config
+from forgetmimic_jax.settings.options import override, parse
+from forgetmimic_jax.training.checkpoint import policy_hash, read_info
 from forgetmimic_jax.viewing import film, offscreen
 
 FILM = [np.full((48, 64, 3), grey, np.uint8) for grey in (0, 128, 255)]

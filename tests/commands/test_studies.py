@@ -11,9 +11,10 @@ import pytest
 from miniature import Run, finished
 from scipy import stats
 
-from forgetmimic_jax import study, sweep, trials, unlearn
-from forgetmimic_jax.errors import InputError, Interrupted
-from forgetmimic_jax.options import parse
+from forgetmimic_jax import sweep, unlearn
+from forgetmimic_jax.basics.errors import InputError, Interrupted
+from forgetmimic_jax.settings.options import parse
+from forgetmimic_jax.studies import study, trials
 
 STUDIES = (
     *("validity", "comparison", "penalty", "heat_map", "motion_types", "physical_behaviour", "training_dynamics"),

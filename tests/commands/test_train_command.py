@@ -13,10 +13,11 @@ import pytest
 from miniature import TINY, finished, load_state
 from trees import assert_same
 
-from forgetmimic_jax import checkpoint, runner, train
-from forgetmimic_jax.config import load_config
+from forgetmimic_jax import train
 from forgetmimic_jax.motion.library import read_manifest, write_manifest
-from forgetmimic_jax.options import parse
+from forgetmimic_jax.settings.config import load_config
+from forgetmimic_jax.settings.options import parse
+from forgetmimic_jax.training import checkpoint, runner
 
 
 @pytest.fixture

@@ -9,12 +9,13 @@ import pytest
 from miniature import TINY, finished, load_state
 from trees import assert_same
 
-from forgetmimic_jax import checkpoint, runner, train, unlearn
-from forgetmimic_jax.config import load_config, validate
-from forgetmimic_jax.errors import Interrupted, run_command
+from forgetmimic_jax import train, unlearn
+from forgetmimic_jax.basics.errors import Interrupted, run_command
+from forgetmimic_jax.basics.files import read_rows
 from forgetmimic_jax.evaluation import evaluate as evaluation
 from forgetmimic_jax.motion.library import DATA_DIR, read_manifest
-from forgetmimic_jax.rows import read_rows
+from forgetmimic_jax.settings.config import load_config, validate
+from forgetmimic_jax.training import checkpoint, runner
 
 
 @pytest.fixture

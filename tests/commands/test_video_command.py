@@ -7,7 +7,7 @@ from miniature import finished
 from PIL import Image
 
 from forgetmimic_jax import video
-from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.viewing import film, offscreen
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.evaluation import plots
 from forgetmimic_jax.evaluation.plots import clip_bars, training_curves
 from forgetmimic_jax.evaluation.report import evaluate_policies, evaluation_document, render_table, write_evaluation

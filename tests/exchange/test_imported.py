@@ -3,9 +3,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.exchange.imported import ImportedActor, check_actor, notes, with_actor, within_limit
-from forgetmimic_jax.state import mean_action
+from forgetmimic_jax.ppo.state import mean_action
 
 RANDOM = np.random.default_rng(0)
 

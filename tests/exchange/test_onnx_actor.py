@@ -2,9 +2,9 @@ import numpy as np
 import onnx
 import pytest
 
-from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.exchange.onnx_actor import OnnxActor, to_onnx
-from forgetmimic_jax.state import mean_action
+from forgetmimic_jax.ppo.state import mean_action
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.exchange.onnx_actor import OnnxActor, to_onnx
 from forgetmimic_jax.exchange.onnx_reader import read_onnx
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.exchange.rsl_rl import read_rsl_rl, read_tensors
 
 POLICIES = Path(__file__).parent / "rsl_rl"  # written by rsl_rl itself: make_rsl_rl_policies.py

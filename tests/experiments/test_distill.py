@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from experiments import distill
-from forgetmimic_jax import checkpoint, runner
-from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.evaluation.rollout import act, begin_episodes
-from forgetmimic_jax.state import init_state
+from forgetmimic_jax.ppo.state import init_state
 from forgetmimic_jax.tracking import env as tracking
+from forgetmimic_jax.training import checkpoint, runner
 
 
 def setup_of(config, library_folder):

@@ -9,9 +9,9 @@ from motion_cases import waving
 from PIL import Image
 
 from forgetmimic_jax import motions
-from forgetmimic_jax.errors import run_command
+from forgetmimic_jax.basics.errors import run_command
 from forgetmimic_jax.motion import library
-from forgetmimic_jax.options import parse
+from forgetmimic_jax.settings.options import parse
 
 
 @pytest.fixture

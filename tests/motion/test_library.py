@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from motion_cases import waving
 
-from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.motion import library
 from forgetmimic_jax.motion.clip import Clip, read_clip, write_clip
 from forgetmimic_jax.motion.fit import fit, on_floor, trimmed

@@ -3,7 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.motion.clip import Clip
 from forgetmimic_jax.motion.kinematics import body_motion, configuration
 from forgetmimic_jax.motion.mirror import mirrored

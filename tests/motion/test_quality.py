@@ -10,7 +10,7 @@ from forgetmimic_jax.motion.clip import Clip
 from forgetmimic_jax.motion.contact import floor_points, floor_positions
 from forgetmimic_jax.motion.fit import on_floor
 from forgetmimic_jax.motion.kinematics import angular_velocity, configuration, rotation
-from forgetmimic_jax.robot import load_robot, relative_height
+from forgetmimic_jax.robot.model import load_robot, relative_height
 
 
 @pytest.fixture(scope="module")

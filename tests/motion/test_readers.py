@@ -5,7 +5,7 @@ import pickle
 import numpy as np
 import pytest
 
-from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.motion.contact import floor_points, floor_positions
 from forgetmimic_jax.motion.kinematics import configuration
 from forgetmimic_jax.motion.readers import read_motion

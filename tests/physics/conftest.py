@@ -2,7 +2,7 @@ import pytest
 from physics_cases import CASES, SUBSTEPS, Inputs, make_inputs
 
 from forgetmimic_jax.physics.native import NativeEngine
-from forgetmimic_jax.robot import Robot, load_robot
+from forgetmimic_jax.robot.model import Robot, load_robot
 
 
 @pytest.fixture(scope="session")

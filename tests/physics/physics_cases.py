@@ -8,7 +8,7 @@ import numpy as np
 from jax import Array
 
 from forgetmimic_jax.physics import Engine, PhysicsParameters, PhysicsState
-from forgetmimic_jax.robot import Robot
+from forgetmimic_jax.robot.model import Robot
 
 SUBSTEPS = 4
 TIMESTEP = 0.005  # s

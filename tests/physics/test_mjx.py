@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from physics_cases import CASES, FLIGHT, SUBSTEPS
 
-from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.physics.mjx import WARP_CONSTRAINTS, WARP_CONTACTS, MjxEngine
-from forgetmimic_jax.robot import load_robot
+from forgetmimic_jax.robot.model import load_robot
 
 HANG = 600  # s: far above any compilation here
 # Half the compilation, the same program.

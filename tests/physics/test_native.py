@@ -22,7 +22,7 @@ from physics_cases import (
 
 from forgetmimic_jax.physics import BodyState
 from forgetmimic_jax.physics.native import NativeEngine
-from forgetmimic_jax.robot import load_robot
+from forgetmimic_jax.robot.model import load_robot
 
 SINGLE = {"rtol": 2e-6, "atol": 2e-6}  # the engine computes in double precision and rounds its outputs once
 

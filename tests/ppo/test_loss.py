@@ -3,8 +3,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from forgetmimic_jax.config import PPOConfig
 from forgetmimic_jax.ppo.loss import adapt_learning_rate, equal_share, policy_loss, trapezoid, value_loss
+from forgetmimic_jax.settings.config import PPOConfig
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from forgetmimic_jax.physics import BodyState
-from forgetmimic_jax.robot import Robot
+from forgetmimic_jax.robot.model import Robot
 from forgetmimic_jax.tracking.reference import Reference
 
 

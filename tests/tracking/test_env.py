@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from forgetmimic_jax.config import Config
 from forgetmimic_jax.physics import BodyState, PhysicsParameters, PhysicsState
+from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.tracking.env import Environment, EnvState, make_assets, make_environment
 from forgetmimic_jax.tracking.reference import lookup

@@ -8,8 +8,8 @@ import pytest
 from scene import body_velocity, on_reference, posed, turned
 from scipy.spatial.transform import Rotation
 
-from forgetmimic_jax.config import NoiseConfig
 from forgetmimic_jax.physics import BodyState, PhysicsState
+from forgetmimic_jax.settings.config import NoiseConfig
 from forgetmimic_jax.tracking.observation import actor_observation, actor_size, critic_observation, observation_noise
 from forgetmimic_jax.tracking.reference import Reference, lookup
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from forgetmimic_jax.config import NoiseConfig
 from forgetmimic_jax.physics import PhysicsState
+from forgetmimic_jax.settings.config import NoiseConfig
 from forgetmimic_jax.tracking.randomise import nominal_parameters, physics_parameters, push, push_interval, reset_state
 from forgetmimic_jax.tracking.reference import lookup
 

@@ -8,7 +8,7 @@ import pytest
 from scene import on_reference, shaken, turned, upright_scene
 from scipy.spatial.transform import Rotation
 
-from forgetmimic_jax.config import RewardConfig
+from forgetmimic_jax.settings.config import RewardConfig
 from forgetmimic_jax.tracking.reference import align_to_anchor, lookup
 from forgetmimic_jax.tracking.reward import (
     regularisation_reward,

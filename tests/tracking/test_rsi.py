@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from forgetmimic_jax.config import SamplingConfig
+from forgetmimic_jax.settings.config import SamplingConfig
 from forgetmimic_jax.tracking.rsi import (
     Bins,
     bin_probabilities,

@@ -6,8 +6,8 @@ import pytest
 from scene import on_reference, turned, upright_scene
 from scipy.spatial.transform import Rotation
 
-from forgetmimic_jax.config import TerminationConfig
-from forgetmimic_jax.robot import load_robot
+from forgetmimic_jax.robot.model import load_robot
+from forgetmimic_jax.settings.config import TerminationConfig
 from forgetmimic_jax.tracking.reference import align_to_anchor, lookup
 from forgetmimic_jax.tracking.termination import terminations
 

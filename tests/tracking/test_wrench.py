@@ -7,7 +7,7 @@ import pytest
 from scene import on_reference, upright_scene
 from scipy.spatial.transform import Rotation
 
-from forgetmimic_jax.config import WrenchConfig
+from forgetmimic_jax.settings.config import WrenchConfig
 from forgetmimic_jax.tracking.wrench import reference_wrench, wrench_gain
 
 GRAVITY = np.array([0.0, 0.0, -9.81])

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from forgetmimic_jax.config import Config, UnlearnConfig
 from forgetmimic_jax.ppo.loss import Batch, Prediction, ppo_loss
+from forgetmimic_jax.settings.config import Config, UnlearnConfig
 from forgetmimic_jax.tracking.reward import Reward
 from forgetmimic_jax.unlearning.registry import find_method
 

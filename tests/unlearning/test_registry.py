@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from forgetmimic_jax.config import Config, UnlearnConfig, preset, to_dict
-from forgetmimic_jax.errors import InputError
+from forgetmimic_jax.basics.errors import InputError
+from forgetmimic_jax.settings.config import Config, UnlearnConfig, preset, to_dict
 from forgetmimic_jax.tracking.reward import Reward
 from forgetmimic_jax.unlearning.method import Method
 from forgetmimic_jax.unlearning.registry import find_method, method_of, methods, unlearning_config

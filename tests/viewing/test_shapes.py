@@ -2,7 +2,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from forgetmimic_jax.robot import VISUAL_GROUP
+from forgetmimic_jax.robot.model import VISUAL_GROUP
 from forgetmimic_jax.viewing.offscreen import drawing_model
 from forgetmimic_jax.viewing.shapes import UNIT_MESHES, shapes
 

@@ -1,0 +1,42 @@
+"""Files that appear whole or not at all, and files of one JSON object a line, such as metrics.jsonl."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """The rows of a file, if there is one. Half a row, as a killed run may leave at the end, is none."""
+    rows = []
+    for line in path.read_text().splitlines() if path.exists() else ():
+        with contextlib.suppress(ValueError):
+            rows.append(json.loads(line))
+    return rows
+
+
+def drop_rows_after(path: Path, iteration: int) -> list[dict[str, Any]]:
+    """Leave and return the rows up to the checkpoint that is resumed from; the run makes the others again."""
+    rows = [row for row in read_rows(path) if row["iteration"] <= iteration]
+    if path.exists():
+        write_atomically(path, "".join(json.dumps(row) + "\n" for row in rows).encode())
+    return rows
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write a file so that a reader, or a crash, sees the old content or the new, never a part."""
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise

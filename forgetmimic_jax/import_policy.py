@@ -1,0 +1,155 @@
+"""Unlearn from the policy you already have: `python -m forgetmimic_jax.import_policy --policy model_3000.pt`."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from forgetmimic_jax.basics.errors import InputError, run_command
+from forgetmimic_jax.settings.options import at_least, parse, replace_given
+
+if TYPE_CHECKING:
+    from jax import Array
+
+    from forgetmimic_jax.training.runner import Setup
+
+
+@dataclass
+class Options:
+    """Turn a tracking policy of rsl_rl, or an ONNX actor, into a base checkpoint to unlearn from and to evaluate.
+
+    Its observations, actions, gains and joint order must be those of this project (wbc-mjlab's terms, README). The
+    actions of the new checkpoint are compared with the original's before anything is written.
+    """
+
+    policy: Path
+    """The policy: a checkpoint of rsl_rl (.pt), or an ONNX file with input obs and output actions."""
+    robot: str = "g1"
+    """Robot under robots/."""
+    library: Path | None = None
+    """Folder of the clips it was trained on; data/ROBOT by default."""
+    preset: Literal["cpu", "paper"] = "cpu"
+    """Settings for going on with it: cpu for a laptop, paper for a GPU."""
+    activation: str | None = None
+    """Activation of a .pt's hidden layers; by default what params/agent.yaml beside it says."""
+    std: float = 0.4
+    """Standard deviation of the exploration noise, in units of action, where the file has none (an ONNX)."""
+    seed: int = 0
+    """Seed of the fresh critic."""
+    output: Path | None = None
+    """Folder of the checkpoint; runs/import-ROBOT by default."""
+
+
+TOLERANCE = 1e-5  # of an action, or of 1 where the action is smaller
+OBSERVATIONS = 20  # a clip, at which the actions are compared
+READERS = (".pt", ".pth", ".onnx")
+
+
+def main(options: Options) -> None:
+    """Read, compare and write."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+    from rich.console import Console
+
+    from forgetmimic_jax.basics.console import closing
+    from forgetmimic_jax.exchange.imported import check_actor, notes, with_actor, within_limit
+    from forgetmimic_jax.exchange.onnx_actor import OnnxActor
+    from forgetmimic_jax.exchange.onnx_reader import read_onnx
+    from forgetmimic_jax.exchange.rsl_rl import read_rsl_rl
+    from forgetmimic_jax.policy.network import MAX_STD, MIN_STD, OBSERVATION_LIMIT
+    from forgetmimic_jax.ppo.state import init_policy, initial_failure_level, mean_action
+    from forgetmimic_jax.robot.model import load_robot
+    from forgetmimic_jax.settings.config import preset
+    from forgetmimic_jax.training import checkpoint, runner
+
+    at_least(0, "--seed", options.seed)
+    if not MIN_STD <= options.std <= MAX_STD:
+        raise InputError(f"--std: found {options.std:g}; accepted: {MIN_STD:g} to {MAX_STD:g}")
+    output = options.output or Path("runs") / f"import-{options.robot}"
+    runner.prepare_folder(output, resume=False)
+    robot = load_robot(options.robot)
+    suffix = options.policy.suffix.lower()
+    if suffix not in READERS:
+        raise InputError(f"{options.policy}: suffix: found '{suffix}'; accepted: {', '.join(READERS)}")
+    is_onnx = suffix == ".onnx"
+    actor = read_onnx(options.policy, robot) if is_onnx else read_rsl_rl(options.policy, options.activation)
+    check_actor(actor, robot, options.policy)
+
+    config = replace_given(preset(options.preset), robot=options.robot, library=options.library, seed=options.seed)
+    config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, actor_layers=actor.hidden_layers))
+    setup = runner.make_setup(config)
+    shapes = runner.template(setup)
+    sizes = (shapes.policy.actor_normalizer.mean.size, shapes.policy.critic_normalizer.mean.size)
+    fresh = init_policy(config, robot.num_joints, *sizes, jax.random.PRNGKey(options.seed))
+    policy = with_actor(fresh, actor, options.std)
+
+    observations = np.asarray(_observations(setup, options.seed))
+    original = OnnxActor(options.policy) if is_onnx else None
+    expected = np.stack([original(each) for each in observations]) if original else actor(observations)
+    found = np.asarray(mean_action(policy, config, jnp.asarray(observations)))
+    inside = within_limit(policy, observations)
+    if not inside.any():
+        raise InputError(
+            f"{options.policy}: every observation of the clips lies past {OBSERVATION_LIMIT:g} standard "
+            f"deviations of its normaliser; is its observation layout another?"
+        )
+    error = float((np.abs(found - expected) / np.maximum(1.0, np.abs(expected)))[inside].max(initial=0.0))
+    if not error <= TOLERANCE:
+        raise InputError(f"{options.policy}: actions differ from the original's by {error:.1e}; nothing was written")
+    checkpoint.save_checkpoint(
+        output,
+        dataclasses.replace(
+            jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes),  # a run that has not begun
+            policy=policy,
+            failure_level=initial_failure_level(config, setup.assets),
+            iteration=jnp.asarray(actor.iteration, jnp.int32),
+        ),
+        config,
+        setup.robot,
+        setup.library,
+        setup.library_hash,
+        environment_steps=0,
+        resumable=False,
+    )
+    told = [f"Actions equal the original's to {error:.0e} at {inside.sum()} observations of the clips."]
+    if not inside.all():
+        told.append(
+            f"{(~inside).sum()} more lie past {OBSERVATION_LIMIT:g} standard deviations, where ours clips them."
+        )
+    told += notes(actor, options.std)
+    if not is_onnx:
+        told.append("A .pt does not name its observations and joints: they are taken to be in this project's order.")
+    Console().print("\n".join(told), highlight=False, soft_wrap=True)
+    library = f" LIBRARY={options.library}" if options.library else ""
+    closing({"base policy": output}, f"make evaluate ROBOT={options.robot}{library} CHECKPOINT={output}")
+
+
+def _observations(setup: Setup, seed: int) -> Array:
+    """Actor observations [n, features] all along every clip, the robot on the reference but for the reset noise."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from forgetmimic_jax.evaluation.rollout import episode_starts
+    from forgetmimic_jax.tracking.observation import actor_observation
+    from forgetmimic_jax.tracking.randomise import reset_state
+    from forgetmimic_jax.tracking.reference import lookup
+
+    starts = episode_starts(np.asarray(setup.library.length), OBSERVATIONS, seed)
+    clip, frame = (jnp.asarray(index, jnp.int32) for index in starts)
+
+    @jax.jit
+    def observe(robot, library, key):
+        reference = lookup(library, clip, frame)
+        physics = reset_state(setup.config.noise, robot, reference, setup.robot.root, key)
+        last_action = jnp.zeros_like(reference.joint_pos)
+        return actor_observation(robot, lookup(library, clip, frame + 1), setup.robot.root, physics, last_action)
+
+    return observe(setup.robot.arrays, setup.library, jax.random.PRNGKey(seed))
+
+
+if __name__ == "__main__":
+    run_command(lambda: main(parse(Options, "import_policy")))

@@ -1,0 +1,114 @@
+"""TrainState: the one pytree that holds all that a run can change. Saved and restored, a run goes on as if unbroken."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jax import Array
+
+from forgetmimic_jax.policy.network import Actor, Critic, Normalizer, distribution, init_normalizer, normalize
+from forgetmimic_jax.settings.config import Config
+from forgetmimic_jax.tracking.env import Assets, Environment, EnvState, observe, reset_where, start_episodes
+from forgetmimic_jax.tracking.rsi import bin_probabilities
+from forgetmimic_jax.tracking.wrench import wrench_gain
+
+
+@struct.dataclass
+class Policy:
+    """What is taken from one run to another: the networks and their normalisers."""
+
+    actor: Any
+    critic: Any
+    actor_normalizer: Normalizer
+    critic_normalizer: Normalizer
+
+
+@struct.dataclass
+class TrainState:
+    """Everything. Every leaf has a dtype, so that the second iteration does not compile again."""
+
+    policy: Policy
+    optimizer: optax.OptState
+    learning_rate: Array  # []
+    env: EnvState
+    failure_level: Array  # [clip, bin] L
+    key: Array
+    iteration: Array  # i32[]
+    diverged: Array  # i32[] environments reset because of NaN or Inf, so far
+
+
+def make_actor(config: Config, num_joints: int) -> Actor:
+    """The actor's module."""
+    return Actor(config.ppo.actor_layers, num_joints, config.ppo.initial_std)
+
+
+def make_critic(config: Config) -> Critic:
+    """The critic's module."""
+    return Critic(config.ppo.critic_layers)
+
+
+def make_optimizer(config: Config) -> optax.GradientTransformation:
+    """Adam on clipped gradients; the step size is applied by the update, where the KL rule can change it."""
+    return optax.chain(optax.clip_by_global_norm(config.ppo.max_gradient_norm), optax.scale_by_adam())
+
+
+def init_policy(config: Config, num_joints: int, actor_size: int, critic_size: int, key: Array) -> Policy:
+    """Random networks and empty normalisers."""
+    actor_key, critic_key = jax.random.split(key)
+    return Policy(
+        actor=make_actor(config, num_joints).init(actor_key, jnp.zeros((1, actor_size))),
+        critic=make_critic(config).init(critic_key, jnp.zeros((1, critic_size))),
+        actor_normalizer=init_normalizer(actor_size),
+        critic_normalizer=init_normalizer(critic_size),
+    )
+
+
+def initial_failure_level(config: Config, assets: Assets) -> Array:
+    """L [clip, bin] before anything was tried."""
+    return jnp.where(assets.bins.valid, jnp.float32(config.sampling.initial_failure), 0.0)
+
+
+def mean_action(policy: Policy, config: Config, observation: Array) -> Array:
+    """The deterministic action [..., joint] at an actor observation [..., features] as the environment gives it."""
+    actor = make_actor(config, policy.actor["params"]["log_std"].size)
+    return distribution(actor, policy.actor, normalize(policy.actor_normalizer, observation))[0]
+
+
+def init_state(
+    env: Environment, assets: Assets, key: Array, policy: Policy | None = None, failure_level: Array | None = None
+) -> TrainState:
+    """A fresh run. With `policy`, a warm start: networks and normalisers from it, Adam reset.
+
+    Args:
+        env: static part.
+        assets: constant arrays.
+        key: random key.
+        policy: of an earlier run.
+        failure_level: L [clip, bin] of an earlier run, for the `frozen` sampler.
+    """
+    config = env.config
+    state_key, policy_key, start_key, episode_key = jax.random.split(key, 4)
+    if failure_level is None:
+        failure_level = initial_failure_level(config, assets)
+    zeros = jnp.zeros((env.num_envs,), jnp.int32)
+    episodes = start_episodes(env, assets, episode_key, zeros, zeros, zeros, zeros.astype(jnp.float32))
+    probabilities = bin_probabilities(config.sampling, assets.bins, failure_level, assets.is_target)
+    gains = wrench_gain(config.wrench, failure_level)
+    episodes = reset_where(env, assets, episodes, jnp.ones((env.num_envs,), bool), start_key, probabilities, gains)
+    if policy is None:
+        actor, critic = observe(env, assets, episodes, None)
+        policy = init_policy(config, env.robot.num_joints, actor.shape[1], critic.shape[1], policy_key)
+    return TrainState(
+        policy=policy,
+        optimizer=make_optimizer(config).init((policy.actor, policy.critic)),
+        learning_rate=jnp.asarray(config.ppo.learning_rate, jnp.float32),
+        env=episodes,
+        failure_level=failure_level,
+        key=state_key,
+        iteration=jnp.zeros((), jnp.int32),
+        diverged=jnp.zeros((), jnp.int32),
+    )

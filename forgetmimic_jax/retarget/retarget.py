@@ -1,0 +1,185 @@
+"""Retarget a human motion to a robot: every limb points the way the human's does, at the robot's own size.
+
+Lengths scale by the ratio of the legs. First inverse kinematics frame by frame (mink) here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mink
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from forgetmimic_jax.motion.deepmimic import LEG_LENGTH, HumanPose
+from forgetmimic_jax.motion.kinematics import quaternion
+from forgetmimic_jax.robot.model import Robot
+
+SIDES = ("left", "right")
+LIMBS = {  # human limb: the robot's bodies at its two ends
+    "thigh": ("hip_roll_link", "knee_link"),
+    "shin": ("knee_link", "foot"),
+    "upper_arm": ("shoulder_roll_link", "elbow_link"),
+    "forearm": ("elbow_link", "wrist_yaw_link"),
+}
+HINGES = {"thigh": "knee_link", "upper_arm": "elbow_link"}  # human limb: the body whose y axis is the hinge below it
+
+
+@dataclass(frozen=True)
+class Vector:
+    """A unit vector of the robot to point along a target: from the origin of `start` to `end`, or `end`'s y axis."""
+
+    name: str
+    start: int | None
+    end: int
+    target: np.ndarray  # [frame, 3] world
+    cost: float
+
+    def value(self, data: mujoco.MjData) -> np.ndarray:
+        if self.start is None:
+            return data.xmat[self.end].reshape(3, 3)[:, 1].copy()
+        along = data.xpos[self.end] - data.xpos[self.start]
+        return along / np.linalg.norm(along)
+
+    def jacobian(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+        """[3, nv] of `value`."""
+        end = np.zeros((3, model.nv))
+        if self.start is None:
+            mujoco.mj_jacBody(model, data, None, end, self.end)
+            return -_cross(self.value(data)) @ end
+        start = np.zeros((3, model.nv))
+        mujoco.mj_jacBody(model, data, end, None, self.end)
+        mujoco.mj_jacBody(model, data, start, None, self.start)
+        along = data.xpos[self.end] - data.xpos[self.start]
+        length = np.linalg.norm(along)
+        unit = along / length
+        return (np.eye(3) - np.outer(unit, unit)) @ (end - start) / length
+
+
+@dataclass(frozen=True)
+class Orientation:
+    """A body and the orientation it is to have."""
+
+    name: str
+    body: int
+    target: Rotation  # [frame]
+    cost: float
+
+
+@dataclass(frozen=True)
+class Targets:
+    """What the robot is asked to do, [frame, ...], world frame."""
+
+    hip_bodies: tuple[int, int]
+    hip_centre: np.ndarray  # [frame, 3] m, midpoint of the hip bodies
+    orientations: tuple[Orientation, ...]
+    vectors: tuple[Vector, ...]
+    scale: float
+
+    @property
+    def num_frames(self) -> int:
+        return len(self.hip_centre)
+
+
+def leg_scale(robot: Robot) -> float:
+    """Robot's leg length, hip to sole, over the human's."""
+    data = mujoco.MjData(robot.model)
+    mujoco.mj_kinematics(robot.model, data)
+    points = [data.xpos[robot.model.body(name).id] for name in ("left_hip_roll_link", "left_knee_link")]
+    foot = data.xpos[_foot(robot, "left")]
+    sole = min(data.geom_xpos[geom][2] - robot.model.geom_size[geom][0] for geom in robot.foot_geom_ids)
+    return (np.linalg.norm(points[1] - points[0]) + np.linalg.norm(foot - points[1]) + foot[2] - sole) / LEG_LENGTH
+
+
+def make_targets(robot: Robot, pose: HumanPose) -> Targets:
+    """Directions from the human's limbs; the hips' path scaled by the legs' ratio."""
+    scale = leg_scale(robot)
+    model = robot.model
+    orientations = [
+        Orientation("pelvis", int(robot.key_body_ids[robot.root]), pose.frames["pelvis"], 1.0),
+        Orientation("torso", robot.anchor_body_id, pose.frames["chest"], 0.5),
+    ]
+    vectors = []
+    for side in SIDES:
+        orientations.append(Orientation(f"{side}_foot", _foot(robot, side), pose.frames[f"{side}_foot"], 0.3))
+        for limb, (start, end) in LIMBS.items():
+            target = pose.frames[f"{side}_{limb}"].apply([0.0, 0.0, -1.0])
+            bodies = [
+                _foot(robot, side) if name == "foot" else model.body(f"{side}_{name}").id for name in (start, end)
+            ]
+            vectors.append(Vector(f"{side}_{limb}", bodies[0], bodies[1], target, 1.0))
+        for limb, body in HINGES.items():
+            axis = pose.frames[f"{side}_{limb}"].apply([0.0, 1.0, 0.0])
+            vectors.append(Vector(f"{side}_{limb}_hinge", None, model.body(f"{side}_{body}").id, axis, 0.15))
+    hips = (model.body("left_hip_roll_link").id, model.body("right_hip_roll_link").id)
+    return Targets(hips, pose.points["pelvis"] * scale, tuple(orientations), tuple(vectors), scale)
+
+
+class VectorTask(mink.Task):
+    """mink's view of a `Vector`."""
+
+    def __init__(self, vector: Vector):
+        super().__init__(cost=np.full(3, vector.cost))
+        self.vector = vector
+        self.frame = 0
+
+    def compute_error(self, configuration: mink.Configuration) -> np.ndarray:
+        return self.vector.value(configuration.data) - self.vector.target[self.frame]
+
+    def compute_jacobian(self, configuration: mink.Configuration) -> np.ndarray:
+        return self.vector.jacobian(configuration.model, configuration.data)
+
+
+def inverse_kinematics(robot: Robot, targets: Targets, limit_margin: float = 0.02) -> np.ndarray:
+    """Frame by frame, each started from the one before: qpos [frame, 7 + joint]."""
+    model = robot.model
+    hip_offset = _hip_centre_offset(robot)
+    base = targets.orientations[0]
+    base_pos = targets.hip_centre - base.target.apply(hip_offset)
+    base_quat = quaternion(base.target)
+
+    frame_tasks = [
+        mink.FrameTask(orientation.body, "body", 2.0 if orientation is base else 0.0, orientation.cost)
+        for orientation in targets.orientations
+    ]
+    vector_tasks = [VectorTask(vector) for vector in targets.vectors]
+    rest = np.concatenate([base_pos[0], base_quat[0], np.asarray(robot.arrays.default_joint_pos, np.float64)])
+    posture = mink.PostureTask(model, cost=0.03)
+    posture.set_target(rest)
+    limits = [mink.ConfigurationLimit(model, min_distance_from_limits=limit_margin)]
+
+    configuration = mink.Configuration(model, rest)
+    qpos = np.empty((targets.num_frames, model.nq))
+    for frame in range(targets.num_frames):
+        for task, orientation in zip(frame_tasks, targets.orientations, strict=True):
+            turn = mink.SO3(orientation.target[frame].as_quat(scalar_first=True))
+            task.set_target(mink.SE3.from_rotation_and_translation(turn, base_pos[frame]))
+        for vector_task in vector_tasks:
+            vector_task.frame = frame
+        for _ in range(100 if frame == 0 else 8):
+            velocity = mink.solve_ik(
+                configuration, [*frame_tasks, *vector_tasks, posture], 1.0, "daqp", damping=1e-3, limits=limits
+            )
+            configuration.integrate_inplace(velocity, 1.0)
+        qpos[frame] = configuration.q
+    return qpos
+
+
+def _hip_centre_offset(robot: Robot) -> np.ndarray:
+    """Midpoint of the hip_roll bodies in the base's frame [3] m, default pose."""
+    data = mujoco.MjData(robot.model)
+    data.qpos[:7] = [0, 0, 0, 1, 0, 0, 0]
+    data.qpos[7:] = 0.0
+    mujoco.mj_kinematics(robot.model, data)
+    return np.mean([data.xpos[robot.model.body(f"{side}_hip_roll_link").id] for side in SIDES], axis=0)
+
+
+def _foot(robot: Robot, side: str) -> int:
+    name = next(robot.key_bodies[foot] for foot in robot.feet if robot.key_bodies[foot].startswith(side))
+    return robot.model.body(name).id
+
+
+def _cross(vector: np.ndarray) -> np.ndarray:
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

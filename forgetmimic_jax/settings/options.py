@@ -1,0 +1,93 @@
+"""What the commands' options have in common: preset, overrides and where a run goes."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import tyro
+import yaml
+
+from forgetmimic_jax.basics.errors import InputError, nearest
+from forgetmimic_jax.settings.config import Config, PhysicsConfig, SamplingConfig, from_dict, to_dict
+
+T = TypeVar("T")
+C = TypeVar("C", Config, PhysicsConfig, SamplingConfig)
+
+# One list for each time that --set is given: what a later one names does not replace an earlier one.
+Settings = Annotated[list[list[str]], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="SECTION.NAME=VALUE")]
+
+
+def parse(options: type[T], command: str, arguments: Sequence[str] | None = None) -> T:
+    """The command line, or `arguments`, as `options`; flags that are none end the command with exit code 2."""
+    name = f"python -m forgetmimic_jax.{command}"
+    return tyro.cli(options, prog=name, args=arguments, config=(tyro.conf.FlagCreatePairsOff,))
+
+
+def check_same(options: Any, saved: dict[str, Any]) -> None:
+    """With --resume the run's own settings hold: InputError for a flag that was given with another value."""
+    for name, value in saved.items():
+        given = getattr(options, name)
+        if given != getattr(type(options), name) and str(given) != str(value):
+            raise InputError(f"--{name}: found {given}, but the run to resume has {value}; leave the flag out")
+
+
+def at_least(minimum: int, flag: str, value: int) -> None:
+    """InputError unless the value given for `flag` is `minimum` or more."""
+    if value < minimum:
+        raise InputError(f"{flag}: found {value}; accepted: {minimum} or more")
+
+
+def comma_separated(text: str) -> tuple[str, ...]:
+    """'punch,kick' → ('punch', 'kick'); spaces and empty parts do not matter."""
+    return tuple(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
+
+
+def override(config: Config, settings: Iterable[str]) -> Config:
+    """The config with settings of the form 'ppo.learning_rate=1e-4' replaced.
+
+    Raises:
+        InputError: not of that form, an unknown setting or a value of the wrong type.
+    """
+    content = to_dict(config)
+    for setting in settings:
+        path, separator, text = setting.partition("=")
+        if not separator:
+            raise InputError(f"--set {setting}: expected SECTION.NAME=VALUE, such as ppo.learning_rate=1e-4")
+        *sections, name = path.split(".")
+        table: Any = content
+        for section in sections:
+            if not isinstance(table.get(section), dict):
+                sections_here = [key for key, value in table.items() if isinstance(value, dict)]
+                raise InputError(f"--set {setting}: no section '{section}'; {nearest(section, sections_here)}")
+            table = table[section]
+        table[name] = _value(text, setting)
+    return from_dict(Config, content, "--set")
+
+
+def _value(text: str, setting: str) -> Any:
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError:
+        raise InputError(f"--set {setting}: '{text}' is no value; expected a number, a word or [a, list]") from None
+    if isinstance(value, str):
+        try:
+            return float(value)  # YAML 1.1 reads 1e-4 as a string
+        except ValueError:
+            return value
+    return value
+
+
+def replace_given(config: C, **values: Any) -> C:
+    """The config with every value that is not None replaced; a path becomes text, as the config holds it."""
+    given: dict[str, Any] = {
+        name: str(value) if isinstance(value, Path) else value for name, value in values.items() if value is not None
+    }
+    return dataclasses.replace(config, **given)
+
+
+def on_engine(config: Config, engine: Literal["auto", "native", "mjx", "mjx-warp"] | None) -> Config:
+    """The config on another physics engine, if one is named."""
+    return dataclasses.replace(config, physics=replace_given(config.physics, engine=engine))

@@ -1,0 +1,4 @@
+"""A run: what it starts from, its loop, its log, its folder and its checkpoints.
+
+One iteration of learning is in `ppo`; what a policy can do is measured in `evaluation`.
+"""

@@ -1,0 +1,71 @@
+"""What a command measures or shows side by side: a checkpoint's policy and, if that was unlearned, its base's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from forgetmimic_jax.basics.errors import InputError
+from forgetmimic_jax.ppo.state import Policy
+from forgetmimic_jax.settings.options import on_engine, replace_given
+from forgetmimic_jax.training import checkpoint, runner
+from forgetmimic_jax.training.checkpoint import CheckpointInfo
+from forgetmimic_jax.training.runner import Setup
+from forgetmimic_jax.unlearning.registry import method_of
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One or two policies on the same robot and clips."""
+
+    setup: Setup
+    policies: dict[str, Policy]  # `base`, or `base` and what the method makes of it, such as `unlearned`
+    info: dict[str, CheckpointInfo]  # of each policy
+    targets: tuple[str, ...]  # clips to forget
+
+
+def load_comparison(
+    path: Path,
+    *,
+    robot: str,
+    base: Path | None = None,
+    targets: tuple[str, ...] | None = None,
+    library: Path | None = None,
+    physics: Literal["auto", "native", "mjx", "mjx-warp"] | None = None,
+) -> Comparison:
+    """A checkpoint's policy and, if that was told to forget, its base's before it.
+
+    Args:
+        path: the checkpoint.
+        robot: name of the robot that it must be for.
+        base: checkpoint to compare with; the one that unlearning started from by default.
+        targets: clips to forget; by default those the checkpoint was told to forget.
+        library: folder of clips; the checkpoint's by default.
+        physics: engine; the checkpoint's by default.
+
+    Raises:
+        InputError: a checkpoint that is damaged or does not fit, a base that was replaced since, or a target that is
+            no clip.
+    """
+    info = checkpoint.read_info(path)
+    config = on_engine(replace_given(info.config, robot=robot, library=library), physics)
+    setup = runner.make_setup(config)
+    forgetful = bool(info.config.unlearn.targets)
+    name: str = method_of(info.config).result if forgetful else "base"
+    compared = {name: info}
+    if forgetful:
+        compared = {"base": checkpoint.read_info(base or runner.base_checkpoint(info.config)), **compared}
+        found = checkpoint.policy_hash(compared["base"])
+        if base is None and info.base not in (None, found):
+            raise InputError(
+                f"{path}: unlearned from the policy {info.base}, but {compared['base'].path} is now {found}; name the "
+                f"base it started from with --base"
+            )
+    for one in reversed(compared.values()):
+        checkpoint.check_matches(one, setup.robot, setup.library, setup.library_hash, config)
+    targets = info.config.unlearn.targets if targets is None else targets
+    runner.check_targets(targets, setup.library.names)
+    shapes = runner.template(setup)
+    policies = {name: checkpoint.load_policy(one.path, shapes) for name, one in compared.items()}
+    return Comparison(setup, policies, compared, targets)

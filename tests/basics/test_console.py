@@ -1,0 +1,27 @@
+import io
+from pathlib import Path
+
+from rich.console import Console
+
+from forgetmimic_jax.basics.console import closing, progress
+
+
+def test_without_a_terminal_there_are_plain_lines():
+    console = Console(file=io.StringIO(), force_terminal=False, width=40)
+    with progress("training", 3, every_seconds=1e6, console=console) as report:
+        for iteration in (1, 2, 3):
+            report(iteration, 100 * iteration, {"tracking_reward": 0.5})
+    lines = console.file.getvalue().splitlines()
+    assert lines[0] == "training: 0/3"
+    assert len(lines) == 2  # the interval has not passed: only the start and the end
+    assert lines[1].startswith("training: 3/3  0 min left  ")
+    assert lines[1].endswith("steps/s  tracking reward 0.5")
+
+
+def test_closing_names_files_and_the_next_command_unbroken():
+    console = Console(file=io.StringIO(), force_terminal=False, width=20)
+    closing(
+        {"table": Path("runs/a/long/enough/to/wrap/evaluation.md")}, "make evaluate CHECKPOINT=[x]", console=console
+    )
+    assert "table  runs/a/long/enough/to/wrap/evaluation.md\n" in console.file.getvalue()
+    assert console.file.getvalue().endswith("Next: make evaluate CHECKPOINT=[x]\n")

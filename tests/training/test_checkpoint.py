@@ -1,0 +1,249 @@
+"""A checkpoint appears whole or not at all, goes back bit for bit, and says which part of it is not what was asked."""
+
+import dataclasses
+import errno
+import json
+import resource
+import shutil
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+import yaml
+from trees import assert_same
+
+from forgetmimic_jax.basics.errors import InputError
+from forgetmimic_jax.ppo.state import TrainState
+from forgetmimic_jax.training import checkpoint, runner
+
+STEPS = 96
+
+
+@pytest.fixture(scope="module")
+def setup(tiny_config, library_folder) -> runner.Setup:
+    return runner.make_setup(dataclasses.replace(tiny_config, library=str(library_folder)))
+
+
+@pytest.fixture(scope="module")
+def template(setup) -> TrainState:
+    return runner.template(setup)
+
+
+@pytest.fixture(scope="module")
+def state(template) -> TrainState:
+    """A TrainState of the right shapes whose every leaf is its own noise."""
+    random = np.random.default_rng(0)
+
+    def noise(leaf: jax.ShapeDtypeStruct) -> np.ndarray:
+        if leaf.dtype == bool:
+            return random.random(leaf.shape) < 0.5
+        return np.asarray(1000.0 * random.random(leaf.shape)).astype(leaf.dtype)
+
+    return dataclasses.replace(jax.tree.map(noise, template), iteration=np.int32(7))
+
+
+def save(path: Path, state: TrainState, setup: runner.Setup, **options) -> Path:
+    checkpoint.save_checkpoint(
+        path, state, setup.config, setup.robot, setup.library, setup.library_hash, environment_steps=STEPS, **options
+    )
+    return path
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory, state, setup) -> Path:
+    return save(tmp_path_factory.mktemp("run") / "checkpoints" / "00000007", state, setup)
+
+
+@pytest.fixture
+def copy(tmp_path, saved) -> Path:
+    """A checkpoint that a test may damage."""
+    return Path(shutil.copytree(saved, tmp_path / "copy"))
+
+
+def test_every_leaf_comes_back_bit_for_bit(saved, state, template):
+    assert_same(checkpoint.load_state(saved, template), state)
+
+
+def test_the_note_says_what_it_belongs_to(saved, setup):
+    info = checkpoint.read_info(saved)
+    assert info.config == setup.config
+    assert (info.robot, info.clips, info.iteration, info.environment_steps) == ("g1", ("sway", "turn", "nod"), 7, STEPS)
+    assert info.joints == setup.robot.joint_names
+    assert info.library_hash == setup.library_hash
+
+
+def test_without_the_run_it_is_a_policy_that_cannot_be_resumed(tmp_path, state, setup, template):
+    path = save(tmp_path / "base", state, setup, resumable=False)
+    assert_same(checkpoint.load_policy(path, template), state.policy)
+    assert_same(checkpoint.load_failure_level(path, template), state.failure_level)
+    with pytest.raises(InputError, match=r"no run/ to resume from; start a new run with --base"):
+        checkpoint.load_state(path, template)
+
+
+def test_a_save_replaces_the_one_before_and_leaves_nothing_else(tmp_path, state, setup, template):
+    (tmp_path / ".00000003.tmp").mkdir()  # a run was killed while it saved
+    for iteration in (1, 2):
+        path = save(tmp_path / "1", dataclasses.replace(state, iteration=np.int32(iteration)), setup)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["1"]
+    assert checkpoint.load_state(path, template).iteration == 2
+
+
+# Orbax leaves a callback behind that finds its event loop closed.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_what_the_system_refuses_is_an_oserror_and_leaves_nothing(tmp_path, saved, state, setup):
+    # A limit on the size of files is a refusal that needs no full disk and no privileges.
+    unlimited = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, unlimited[1]))
+    try:
+        with pytest.raises(OSError, match=r"File too large: .*00000009") as refusal:
+            save(tmp_path / "00000009", state, setup)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, unlimited)
+    assert refusal.value.filename == str(tmp_path / "00000009")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_is_told_before_anything_is_written(tmp_path, state, setup, monkeypatch):
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _path: usage._replace(free=2**20))
+    with pytest.raises(OSError, match=r"No space left on device: \d+ MiB are needed") as refusal:
+        save(tmp_path / "00000009", state, setup)
+    assert (refusal.value.errno, refusal.value.filename) == (errno.ENOSPC, str(tmp_path))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_failed_save_leaves_the_one_before(tmp_path, state, setup, template, monkeypatch):
+    path = save(tmp_path / "1", state, setup)
+    monkeypatch.setattr(checkpoint, "save_config", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left")))
+    with pytest.raises(OSError, match="No space left"):
+        save(path, dataclasses.replace(state, iteration=np.int32(8)), setup)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["1"]
+    assert_same(checkpoint.load_state(path, template), state)
+
+
+@pytest.mark.parametrize("part", ["policy", "sampler", "run"])
+def test_every_missing_or_damaged_file_is_told_by_name(saved, tmp_path, template, part):
+    names = sorted(file.relative_to(saved) for file in (saved / part).rglob("*") if file.is_file())
+    assert len(names) > 3
+    for name in names:
+        copy = Path(shutil.copytree(saved, tmp_path / "copy"))
+        whole = (copy / name).read_bytes()
+        (copy / name).write_bytes(whole[: len(whole) // 2] + (b"" if whole else b"x"))
+        with pytest.raises(InputError, match=rf"^{copy / name}: damaged: not what was saved; "):
+            checkpoint.load_state(copy, template)
+        (copy / name).unlink()
+        with pytest.raises(InputError, match=rf"^{copy / name}: missing; "):
+            checkpoint.load_state(copy, template)
+        shutil.rmtree(copy)
+
+
+def test_a_missing_part_is_told(copy, template):
+    shutil.rmtree(copy / "policy")
+    with pytest.raises(InputError, match=r"copy/policy/\S+: missing"):
+        checkpoint.load_policy(copy, template)
+
+
+def edit_note(path: Path, **changes) -> None:
+    note = json.loads((path / "meta.json").read_text())
+    (path / "meta.json").write_text(json.dumps(note | changes))
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        ("{", "damaged: "),
+        ("[]", "damaged: "),
+        ("{}", "damaged: no schema"),
+        ('{"schema": 1}', "damaged: no robot"),
+        ('{"schema": 2}', "schema: found 2; this version reads 1"),
+        ('{"schema": 1, "robot": "g1", "joints": 3}', "damaged: "),
+        ('{"schema": 1, "robot": "g1", "joints": [], "clips": [], "library_hash": "", "iteration": "x"}', "damaged: "),
+    ],
+)
+def test_a_damaged_note_is_told(copy, content, told):
+    (copy / "meta.json").write_text(content)
+    with pytest.raises(InputError, match=rf"copy/meta.json: {told}"):
+        checkpoint.read_info(copy)
+
+
+def test_what_is_no_checkpoint_is_told(tmp_path, saved):
+    with pytest.raises(InputError, match="nothing: no such checkpoint folder"):
+        checkpoint.read_info(tmp_path / "nothing")
+    with pytest.raises(InputError, match=r"not a checkpoint: no meta.json$"):
+        checkpoint.read_info(tmp_path)
+    with pytest.raises(InputError, match=rf"it is a run, whose newest checkpoint is {saved}$"):
+        checkpoint.read_info(saved.parent.parent)
+
+
+def test_an_unknown_setting_is_told_with_its_file(copy):
+    settings = yaml.safe_load((copy / "config.yaml").read_text())
+    settings["ppo"]["learning_rat"] = settings["ppo"].pop("learning_rate")
+    (copy / "config.yaml").write_text(yaml.safe_dump(settings))
+    with pytest.raises(
+        InputError, match=r"config.yaml: ppo: unknown setting 'learning_rat'; did you mean 'learning_rate'\?"
+    ):
+        checkpoint.read_info(copy)
+
+
+def matches(path: Path, setup: runner.Setup, **options) -> None:
+    info = checkpoint.read_info(path)
+    checkpoint.check_matches(info, setup.robot, setup.library, setup.library_hash, setup.config, **options)
+
+
+def test_another_robot_or_other_joints_are_told(copy, setup):
+    matches(copy, setup)
+    edit_note(copy, robot="h2")
+    with pytest.raises(InputError, match=r"copy: robot: the checkpoint's is 'h2' \(\d+ joints\), asked for 'g1'"):
+        matches(copy, setup)
+    edit_note(copy, robot="g1", joints=list(setup.robot.joint_names[:-1]))
+    with pytest.raises(InputError, match="robot: "):
+        matches(copy, setup)
+
+
+def test_another_library_is_told_clip_by_clip_and_can_be_allowed(copy, setup):
+    edit_note(copy, clips=["sway", "turn", "walk"])
+    with pytest.raises(InputError, match=r"library: .*\(missing here: walk; new here: nod\)"):
+        matches(copy, setup)
+    matches(copy, setup, other_library=True)
+    edit_note(copy, clips=["sway", "turn", "nod"], library_hash="0" * 16)
+    with pytest.raises(InputError, match=rf"hash is {'0' * 16}, this library's {setup.library_hash} \(same clip names"):
+        matches(copy, setup)
+
+
+@pytest.mark.parametrize("name", ["actor_layers", "critic_layers"])
+def test_another_network_is_told(saved, setup, name):
+    ppo = dataclasses.replace(setup.config.ppo, **{name: (8, 8)})
+    other = dataclasses.replace(setup, config=dataclasses.replace(setup.config, ppo=ppo))
+    with pytest.raises(InputError, match=rf"ppo.{name}: the checkpoint's is \[16.*\], asked for \[8, 8\]"):
+        matches(saved, other)
+
+
+def test_other_environments_matter_to_a_resumed_run_only(saved, setup):
+    ppo = dataclasses.replace(setup.config.ppo, num_envs=16)
+    other = dataclasses.replace(setup, config=dataclasses.replace(setup.config, ppo=ppo))
+    matches(saved, other)
+    with pytest.raises(InputError, match=r"ppo.num_envs: the checkpoint's is 8, asked for 16"):
+        matches(saved, other, resume=True)
+
+
+def test_a_network_of_another_size_cannot_slip_through(copy, setup):
+    # A config.yaml that was edited passes for the checkpoint's; the arrays do not.
+    ppo = dataclasses.replace(setup.config.ppo, actor_layers=(8, 16))
+    other = runner.make_setup(dataclasses.replace(setup.config, ppo=ppo))
+    told = r"copy/policy: policy.actor.params.\S+: found shape \[16\]; \[8\] is needed"
+    with pytest.raises(InputError, match=told):
+        checkpoint.load_policy(copy, runner.template(other))
+    ppo = dataclasses.replace(setup.config.ppo, actor_layers=(16, 16, 16))
+    other = runner.make_setup(dataclasses.replace(setup.config, ppo=ppo))
+    with pytest.raises(InputError, match=r"copy/policy: damaged or of another structure: ") as told:
+        checkpoint.load_policy(copy, runner.template(other))
+    assert "\n" not in str(told.value)
+
+
+def test_the_newest_is_the_highest_whole_one(tmp_path, saved):
+    assert checkpoint.newest_checkpoint(tmp_path) is None
+    for name in ("00000009", "00000100", "00000200 (copy)", "best", ".00000300.tmp", "00000400"):
+        shutil.copytree(saved, tmp_path / "checkpoints" / name)
+    (tmp_path / "checkpoints" / "00000400" / "meta.json").unlink()
+    assert checkpoint.newest_checkpoint(tmp_path) == tmp_path / "checkpoints" / "00000100"
