@@ -17,6 +17,7 @@ from forgetmimic_jax.settings.config import Config, preset
 os.environ["XLA_FLAGS"] += " --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 
 SWAY_FRAMES, TURN_FRAMES = 80, 41
+SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"  # real files of other projects, not committed
 
 
 def invented_clip(robot: Robot, name: str, frames: int, yaw_rate: float, speed: float) -> Clip:
@@ -84,4 +85,22 @@ def library_folder(robot, tmp_path_factory) -> Path:
         write_clip(invented_clip(robot, name, frames, yaw_rate, 0.2), folder / f"{name}.npz")
         entries[name] = {"sha256": file_hash(folder / f"{name}.npz")}
     write_manifest(folder, {"schema": 1, "robot": "g1", "fps": 50.0, "default_targets": ["turn"], "clips": entries})
+    return folder
+
+
+@pytest.fixture(scope="session")
+def samples() -> Path:
+    """Folder with G1 clips in the three formats."""
+    folder = SHARED / "motions"
+    if not folder.is_dir():
+        pytest.skip("sample motions are not committed: no ../shared/data/motions beside this checkout")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def deepmimic() -> Path:
+    """Folder with DeepMimic's human clips."""
+    folder = SHARED / "deepmimic"
+    if not folder.is_dir():
+        pytest.skip("DeepMimic's clips are not committed: no ../shared/data/deepmimic beside this checkout")
     return folder
