@@ -44,22 +44,29 @@ def main(options: Options) -> None:
     from rich.table import Table
 
     from forgetmimic_jax.physics.engine import resolve_engine
-    from forgetmimic_jax.ppo.update import collect, make_iteration
+    from forgetmimic_jax.ppo.collect import collect
+    from forgetmimic_jax.ppo.update import make_iteration
     from forgetmimic_jax.settings.config import preset
     from forgetmimic_jax.tracking import env as tracking
     from forgetmimic_jax.tracking.rsi import bin_probabilities
-    from forgetmimic_jax.training import runner
+    from forgetmimic_jax.tracking.setup import make_setup
+    from forgetmimic_jax.training.folder import check_writable
+    from forgetmimic_jax.training.start import start_state
 
     at_least(1, "--repeats", options.repeats)
     if options.output:
-        runner.check_writable(options.output.parent)
+        check_writable(options.output.parent)
         if options.output.is_dir():
             raise InputError(f"{options.output}: a folder; --output is a file")
     config = replace_given(preset(options.preset), robot=options.robot, library=options.library)
     config = on_engine(config, options.physics)
-    setup = runner.make_setup(config)
-    env, assets, steps = setup.env, setup.assets, config.ppo.num_steps
-    state = runner.start_state(setup)
+    setup = make_setup(config)
+    env, assets, steps = (
+        tracking.make_environment(setup, config.ppo.num_envs),
+        tracking.make_assets(setup),
+        config.ppo.num_steps,
+    )
+    state = start_state(setup, env, assets)
     first_iteration = make_iteration(env)
     state, _ = jax.block_until_ready(first_iteration(assets, state))
     to_first_step = time.perf_counter() - started

@@ -38,14 +38,15 @@ def main(options: Options) -> None:
     """Evaluate, write the files and print the table."""
     from forgetmimic_jax.basics.console import closing
     from forgetmimic_jax.evaluation.evaluate import cost, evaluate, show_and_write
-    from forgetmimic_jax.training import runner
     from forgetmimic_jax.training.comparison import load_comparison
+    from forgetmimic_jax.training.folder import check_writable, folder_of
+    from forgetmimic_jax.training.start import base_folder
 
     at_least(1, "--episodes", options.episodes)
     at_least(0, "--seed", options.seed)
-    path = options.checkpoint or runner.base_folder(options.robot)
-    output = options.output or runner.folder_of(path) or Path("runs") / f"evaluate-{options.robot}"
-    runner.check_writable(output)
+    path = options.checkpoint or base_folder(options.robot)
+    output = options.output or folder_of(path) or Path("runs") / f"evaluate-{options.robot}"
+    check_writable(output)
     compared = load_comparison(
         path,
         robot=options.robot,
@@ -56,10 +57,7 @@ def main(options: Options) -> None:
     )
     setup = compared.setup
     document = evaluate(
-        setup.config,
-        setup.robot,
-        setup.library,
-        setup.library_hash,
+        setup,
         compared.policies,
         checkpoint=str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path),
         targets=compared.targets,

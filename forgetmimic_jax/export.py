@@ -51,26 +51,30 @@ def main(options: Options) -> None:
     from forgetmimic_jax.evaluation.rollout import Evaluator
     from forgetmimic_jax.exchange.closed_loop import run_episodes
     from forgetmimic_jax.exchange.onnx_actor import OnnxActor, to_onnx
-    from forgetmimic_jax.ppo.state import mean_action
-    from forgetmimic_jax.training import checkpoint, runner
+    from forgetmimic_jax.tracking.setup import make_setup
+    from forgetmimic_jax.training import checkpoint
+    from forgetmimic_jax.training.folder import check_writable, folder_of
+    from forgetmimic_jax.training.start import base_folder
 
     at_least(1, "--episodes", options.episodes)
     at_least(0, "--seed", options.seed)
-    path = options.checkpoint or runner.base_folder(options.robot)
-    output = options.output or (runner.folder_of(path) or Path("runs") / f"export-{options.robot}") / "policy.onnx"
-    runner.check_writable(output.parent)
+    path = options.checkpoint or base_folder(options.robot)
+    output = options.output or (folder_of(path) or Path("runs") / f"export-{options.robot}") / "policy.onnx"
+    check_writable(output.parent)
     if output.is_dir():
         raise InputError(f"{output}: a folder; --output is a file")
     info = checkpoint.read_info(path)
     # The evaluation to reproduce is that of MuJoCo's C engine, which the check runs on too.
     config = on_engine(replace_given(info.config, robot=options.robot, library=options.library), "native")
-    setup = runner.make_setup(config)
-    checkpoint.check_matches(info, setup.robot, setup.library, setup.library_hash, config, other_library=True)
-    policy = checkpoint.load_policy(path, runner.template(setup))
+    setup = make_setup(config)
+    checkpoint.check_matches(info, setup, other_library=True)
+    policy = checkpoint.load_policy(info)
 
     run_path = f"{info.robot}/{checkpoint.policy_hash(info)}"
-    content = to_onnx(policy, setup.robot, run_path=run_path, control_step=setup.env.control_step).SerializeToString()
-    evaluator = Evaluator(config, setup.robot, setup.library, episodes=options.episodes, seed=options.seed)
+    content = to_onnx(
+        policy, setup.robot, run_path=run_path, control_step=config.physics.control_step
+    ).SerializeToString()
+    evaluator = Evaluator(setup, episodes=options.episodes, seed=options.seed)
     start = evaluator.start()
     with progress("run the ONNX in MuJoCo", len(evaluator.clip)) as report:
         record = run_episodes(
@@ -81,7 +85,7 @@ def main(options: Options) -> None:
             start,
             report=lambda episodes, steps: report(episodes, steps, {}),
         )
-    expected = np.asarray(jax.jit(mean_action, static_argnums=1)(policy, config, record.observations))
+    expected = np.asarray(jax.jit(policy.mean_action)(record.observations))
     error = float((np.abs(record.actions - expected) / np.maximum(1.0, np.abs(expected))).max())
     if not error <= ACTION_TOLERANCE:
         raise InputError(f"{path}: the ONNX's actions differ from the policy's by {error:.1e}; nothing was written")

@@ -13,7 +13,7 @@ from forgetmimic_jax.settings.options import at_least, parse, replace_given
 if TYPE_CHECKING:
     from jax import Array
 
-    from forgetmimic_jax.training.runner import Setup
+    from forgetmimic_jax.tracking.setup import Setup
 
 
 @dataclass
@@ -49,7 +49,6 @@ READERS = (".pt", ".pth", ".onnx")
 
 def main(options: Options) -> None:
     """Read, compare and write."""
-    import jax
     import jax.numpy as jnp
     import numpy as np
     from rich.console import Console
@@ -59,17 +58,22 @@ def main(options: Options) -> None:
     from forgetmimic_jax.exchange.onnx_actor import OnnxActor
     from forgetmimic_jax.exchange.onnx_reader import read_onnx
     from forgetmimic_jax.exchange.rsl_rl import read_rsl_rl
-    from forgetmimic_jax.policy.network import MAX_STD, MIN_STD, OBSERVATION_LIMIT
-    from forgetmimic_jax.ppo.state import init_policy, initial_failure_level, mean_action
+    from forgetmimic_jax.policy.gaussian import MAX_STD, MIN_STD
+    from forgetmimic_jax.policy.normalizer import OBSERVATION_LIMIT
     from forgetmimic_jax.robot.model import load_robot
     from forgetmimic_jax.settings.config import preset
-    from forgetmimic_jax.training import checkpoint, runner
+    from forgetmimic_jax.tracking.env import make_assets
+    from forgetmimic_jax.tracking.rsi import initial_failure_level
+    from forgetmimic_jax.tracking.setup import make_setup
+    from forgetmimic_jax.training import checkpoint
+    from forgetmimic_jax.training.folder import prepare_folder
+    from forgetmimic_jax.training.start import fresh_policy
 
     at_least(0, "--seed", options.seed)
     if not MIN_STD <= options.std <= MAX_STD:
         raise InputError(f"--std: found {options.std:g}; accepted: {MIN_STD:g} to {MAX_STD:g}")
     output = options.output or Path("runs") / f"import-{options.robot}"
-    runner.prepare_folder(output, resume=False)
+    prepare_folder(output, resume=False)
     robot = load_robot(options.robot)
     suffix = options.policy.suffix.lower()
     if suffix not in READERS:
@@ -80,16 +84,14 @@ def main(options: Options) -> None:
 
     config = replace_given(preset(options.preset), robot=options.robot, library=options.library, seed=options.seed)
     config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, actor_layers=actor.hidden_layers))
-    setup = runner.make_setup(config)
-    shapes = runner.template(setup)
-    sizes = (shapes.policy.actor_normalizer.mean.size, shapes.policy.critic_normalizer.mean.size)
-    fresh = init_policy(config, robot.num_joints, *sizes, jax.random.PRNGKey(options.seed))
-    policy = with_actor(fresh, actor, options.std)
+    setup = make_setup(config)
+    assets = make_assets(setup)
+    policy = with_actor(fresh_policy(setup, assets), actor, options.std)
 
     observations = np.asarray(_observations(setup, options.seed))
     original = OnnxActor(options.policy) if is_onnx else None
     expected = np.stack([original(each) for each in observations]) if original else actor(observations)
-    found = np.asarray(mean_action(policy, config, jnp.asarray(observations)))
+    found = np.asarray(policy.mean_action(jnp.asarray(observations)))
     inside = within_limit(policy, observations)
     if not inside.any():
         raise InputError(
@@ -99,21 +101,8 @@ def main(options: Options) -> None:
     error = float((np.abs(found - expected) / np.maximum(1.0, np.abs(expected)))[inside].max(initial=0.0))
     if not error <= TOLERANCE:
         raise InputError(f"{options.policy}: actions differ from the original's by {error:.1e}; nothing was written")
-    checkpoint.save_checkpoint(
-        output,
-        dataclasses.replace(
-            jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes),  # a run that has not begun
-            policy=policy,
-            failure_level=initial_failure_level(config, setup.assets),
-            iteration=jnp.asarray(actor.iteration, jnp.int32),
-        ),
-        config,
-        setup.robot,
-        setup.library,
-        setup.library_hash,
-        environment_steps=0,
-        resumable=False,
-    )
+    level = initial_failure_level(config.sampling, assets.bins)
+    checkpoint.save_policy(output, setup, policy, level, checkpoint.Progress(actor.iteration, environment_steps=0))
     told = [f"Actions equal the original's to {error:.0e} at {inside.sum()} observations of the clips."]
     if not inside.all():
         told.append(

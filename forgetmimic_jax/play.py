@@ -35,8 +35,8 @@ def main(options: Options) -> None:
     """Serve the page until Ctrl-C."""
     from rich.console import Console
 
-    from forgetmimic_jax.training import runner
     from forgetmimic_jax.training.comparison import load_comparison
+    from forgetmimic_jax.training.start import base_folder
     from forgetmimic_jax.viewing.page import Page
     from forgetmimic_jax.viewing.playback import Playback
     from forgetmimic_jax.viewing.side_by_side import SideBySide
@@ -44,10 +44,10 @@ def main(options: Options) -> None:
     at_least(0, "--seed", options.seed)
     if not 1024 <= options.port <= 65535:
         raise InputError(f"--port: found {options.port}; accepted: 1024 to 65535")
-    path = options.checkpoint or runner.base_folder(options.robot)
+    path = options.checkpoint or base_folder(options.robot)
     compared = load_comparison(path, robot=options.robot, base=options.base, library=options.library, physics="native")
     robot, library = compared.setup.robot, compared.setup.library
-    stage = SideBySide(compared.setup.config, robot, library, compared.policies)
+    stage = SideBySide(compared.setup, compared.policies)
     first = library.names.index(compared.targets[0]) if compared.targets else 0
     playback = Playback(stage, robot, first, seed=options.seed)
     playback.advance()  # compiles

@@ -57,7 +57,8 @@ def main(options: Options) -> None:
     from forgetmimic_jax.basics.files import read_rows, write_atomically
     from forgetmimic_jax.evaluation import plots, tables
     from forgetmimic_jax.evaluation.verdict import RULES, judge
-    from forgetmimic_jax.training import checkpoint, runner
+    from forgetmimic_jax.training import checkpoint
+    from forgetmimic_jax.training.folder import check_writable
 
     at_least(0, "--films", options.films)
     output = options.output or options.run / "report.html"
@@ -65,7 +66,7 @@ def main(options: Options) -> None:
         raise InputError(f"{output}: --output is an .html file")
     document = read_evaluation(options.run)
     path = _checkpoint(options.run, document)
-    runner.check_writable(output.parent)
+    check_writable(output.parent)
     info = checkpoint.read_info(path)
     base = _base(options, document, info)
     control = None if options.control is None else _control(options.control, document)
@@ -157,9 +158,10 @@ def _checkpoint(run: Path, document: Mapping[str, Any]) -> Path:
 
 def _base(options: Options, document: Mapping[str, Any], info: CheckpointInfo) -> CheckpointInfo:
     """The base that was evaluated; a shipped one may have been replaced since."""
-    from forgetmimic_jax.training import checkpoint, runner
+    from forgetmimic_jax.training import checkpoint
+    from forgetmimic_jax.training.start import base_checkpoint
 
-    base = checkpoint.read_info(options.base or runner.base_checkpoint(info.config))
+    base = checkpoint.read_info(options.base or base_checkpoint(info.config))
     evaluated = document.get("budget", {}).get("base", {}).get("environment_steps", base.environment_steps)
     if evaluated != base.environment_steps:
         raise InputError(
@@ -409,7 +411,7 @@ def _films(
         else:
             compared = load_comparison(info.path, robot=info.robot, base=base.path, physics="native")
             setup = compared.setup
-            episodes = record(setup.config, setup.robot, setup.library, compared.policies, needed)
+            episodes = record(setup, compared.policies, needed)
             with film.pane_renderer(info.robot) as renderer, progress("film", len(needed)) as report:
                 for done, episode in enumerate(episodes, start=1):
                     target = episode.clip in document["targets"]

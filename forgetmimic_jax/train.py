@@ -41,10 +41,12 @@ def main(options: Options) -> None:
     """Train, and say where the checkpoint is."""
     from forgetmimic_jax.basics.console import closing
     from forgetmimic_jax.settings.config import load_config, preset
-    from forgetmimic_jax.training import runner
+    from forgetmimic_jax.tracking.setup import make_setup
+    from forgetmimic_jax.training.folder import BEST, prepare_folder
+    from forgetmimic_jax.training.run import run
 
     output = options.output or Path("runs") / f"train-{options.robot}"
-    runner.prepare_folder(output, resume=options.resume)
+    prepare_folder(output, resume=options.resume)
     if options.resume:
         config = load_config(output / "config.yaml")
         check_same(options, {name: getattr(config, name) for name in ("robot", "preset", "seed", "library", "base")})
@@ -57,9 +59,9 @@ def main(options: Options) -> None:
             base=options.base,
         )
     config = override(replace_given(config, iterations=options.iterations), itertools.chain(*options.set))
-    setup = runner.make_setup(on_engine(config, options.physics))
-    path, _ = runner.run(setup, output, description=f"train {config.robot}", resume=options.resume)
-    best = output / runner.BEST
+    setup = make_setup(on_engine(config, options.physics))
+    path, _ = run(setup, output, description=f"train {config.robot}", resume=options.resume)
+    best = output / BEST
     files = {"checkpoint": path}
     if best.is_dir():
         files |= {"best policy": best, "clips over time": output / "evaluations.png"}

@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from forgetmimic_jax.basics.errors import InputError, run_command
 from forgetmimic_jax.settings.config import Config, UnlearnConfig, WrenchConfig, load_config, preset
@@ -71,57 +71,39 @@ class Options:
     """Any other settings, such as ppo.learning_rate=1e-4."""
 
 
-ITERATIONS = {"cpu": 640, "paper": 1000}
-# On a laptop (experiments/pace.md): short iterations, for forgetting takes some hundred whatever their length. Targets
-# would be a few steps in a hundred, less as they are forgotten, so they have more of the uniform starts (the other
-# samplers keep the shares that they are compared for) and clips weigh the same; and what the noise of fast learning
-# would do to the kept clips, the base holds.
-TARGET_SHARE = 0.5
-PACE: dict[str, Any] = {
-    "num_steps": 12,
-    "minibatches": 4,
-    "epochs": 2,
-    "schedule": "trapezoid",
-    "learning_rate": 3e-4,
-    "clip_value": False,
-    "equal_clips": True,
-    "anchor": 0.1,
-}
-# A fresh policy learns from what the base would do, which has little noise: many small updates, fewer iterations.
-TAUGHT: dict[str, Any] = {"minibatches": 12, "epochs": 4, "anchor": 1.0}
-TAUGHT_ITERATIONS = {"cpu": 200, "paper": 1000}
-
-
 def main(options: Options) -> None:
     """Unlearn, evaluate base, new policy and zero action, and print what was forgotten and what was kept."""
     from forgetmimic_jax.basics.console import closing
     from forgetmimic_jax.evaluation.evaluate import cost, evaluate, show_and_write
-    from forgetmimic_jax.training import checkpoint, runner
+    from forgetmimic_jax.tracking.setup import make_setup
+    from forgetmimic_jax.training import checkpoint
+    from forgetmimic_jax.training.folder import default_folder, prepare_folder
+    from forgetmimic_jax.training.run import interrupted, run
+    from forgetmimic_jax.training.start import base_checkpoint, base_policy
     from forgetmimic_jax.unlearning.registry import method_of
 
     at_least(1, "--episodes", options.episodes)
-    output = options.output or runner.default_folder(f"unlearn-{options.robot}", resume=options.resume)
-    runner.prepare_folder(output, resume=options.resume)
+    output = options.output or default_folder(f"unlearn-{options.robot}", resume=options.resume)
+    prepare_folder(output, resume=options.resume)
     config = _config_of_run(options, output) if options.resume else config_of_new_run(options)
     config = override(replace_given(config, iterations=options.iterations), itertools.chain(*options.set))
     if not config.unlearn.targets:
         raise InputError("--targets: no clip named; name at least one to forget, such as --targets punch,kick")
-    setup = runner.with_base(runner.make_setup(on_engine(config, options.physics)))
-    info = checkpoint.read_info(runner.base_checkpoint(config))
+    setup = make_setup(on_engine(config, options.physics))
+    base = base_policy(setup)
+    setup = dataclasses.replace(setup, base=base)
+    info = checkpoint.read_info(base_checkpoint(config))
     description = f"forget {', '.join(config.unlearn.targets)}"
     method = method_of(config)
     if method.result == "fine_tuned" and config.sampling.clips == "all":
         description = "fine-tune on all clips"  # which is no forgetting
     elif config.unlearn.method != UnlearnConfig.method:
         description += f" by {config.unlearn.method}"
-    path, state = runner.run(setup, output, description=description, resume=options.resume)
+    path, state = run(setup, output, description=description, resume=options.resume)
     try:
         document = evaluate(
-            setup.config,
-            setup.robot,
-            setup.library,
-            setup.library_hash,
-            {"base": setup.assets.base, method.result: state.policy},
+            setup,
+            {"base": base, method.result: state.policy},
             checkpoint=str(path),
             targets=config.unlearn.targets,
             episodes=options.episodes,
@@ -129,7 +111,7 @@ def main(options: Options) -> None:
             budget={"base": cost(info), method.result: cost(checkpoint.read_info(path))},
         )
     except KeyboardInterrupt:
-        raise runner.interrupted(config, output) from None
+        raise interrupted(config, output) from None
     name = f"{method.result.replace('_', '-')} policy"
     files = {name: path, **show_and_write(output, document), "curves": output / "metrics.jsonl"}
     closing(files, f"make evaluate ROBOT={config.robot} CHECKPOINT={path} EPISODES=100")
@@ -137,45 +119,44 @@ def main(options: Options) -> None:
 
 def config_of_new_run(options: Options) -> Config:
     """The base's settings, or the preset's, as the method and the flags change them."""
-    from forgetmimic_jax.training import checkpoint, runner
+    from forgetmimic_jax.tracking.setup import default_targets
+    from forgetmimic_jax.training import checkpoint
+    from forgetmimic_jax.training.start import base_folder
     from forgetmimic_jax.unlearning.registry import find_method, unlearning_config
 
-    info = checkpoint.read_info(options.base or runner.base_folder(options.robot))
-    base = config = info.config
-    if options.preset:
-        config = preset(options.preset)
-        # The network is the base's, and so are the bins of its failure levels: they are what unlearning starts from.
-        layers: dict[str, Any] = {name: getattr(base.ppo, name) for name in ("actor_layers", "critic_layers")}
-        sampling = dataclasses.replace(config.sampling, bin_seconds=base.sampling.bin_seconds)
-        ppo = dataclasses.replace(config.ppo, **layers)
-        config = dataclasses.replace(config, library=base.library, sampling=sampling, ppo=ppo)
-    start = find_method(options.method).start
-    iterations = (TAUGHT_ITERATIONS if start == "taught" else ITERATIONS)[options.preset or "cpu"]
-    if start == "fresh":
-        # The base may be an unlearned policy, whose settings held it to its own base.
-        config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, anchor=0.0))
-        if not info.environment_steps and options.iterations is None:
-            raise InputError(f"--iterations: {info.path} does not say how long it was trained; say how long to retrain")
-        iterations = max(1, round(info.environment_steps / (config.ppo.num_envs * config.ppo.num_steps)))
-    elif config.preset == "cpu":
-        # A base's last training may have been slowed down to settle it, and forgetting has to be done in its budget:
-        # fast at first, settling what is kept at the end. The targets' values change sign, which a clip would slow.
-        config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, **PACE))
-    if start == "taught":
-        taught = TAUGHT if config.preset == "cpu" else {"anchor": TAUGHT["anchor"]}
-        config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, **taught))
-    config = dataclasses.replace(config, base=None, evaluate_every=0, iterations=iterations)
+    info = checkpoint.read_info(options.base or base_folder(options.robot))
+    config = _on_preset(info.config, options.preset) if options.preset else info.config
+    config = dataclasses.replace(config, base=None, evaluate_every=0)
     config = replace_given(config, robot=options.robot, seed=options.seed, library=options.library, base=options.base)
-    targets = runner.default_targets(config) if options.targets is None else comma_separated(options.targets)
+    targets = default_targets(config) if options.targets is None else comma_separated(options.targets)
     unlearn = UnlearnConfig(targets=targets, penalty=options.penalty, method=options.method)
     config = unlearning_config(config, unlearn)
+    pace = find_method(options.method).pace
+    config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, **pace.ppo.get(config.preset, {})))
     sampling = replace_given(config.sampling, rule=options.sampler, clips=options.clips)
-    if start == "base" and config.preset == "cpu" and (sampling.rule, sampling.clips) == ("uniform_clips", "all"):
-        sampling = dataclasses.replace(sampling, target_share=TARGET_SHARE)
-    if not options.wrench:
-        return dataclasses.replace(config, sampling=sampling)
-    wrench = dataclasses.replace(config.wrench, max_gain=base.wrench.max_gain or WrenchConfig.max_gain)
-    return dataclasses.replace(config, sampling=sampling, wrench=wrench)
+    if (sampling.rule, sampling.clips) == ("uniform_clips", "all"):  # the other samplers' shares are their own
+        sampling = dataclasses.replace(sampling, target_share=pace.target_share.get(config.preset, 0.0))
+    wrench = config.wrench
+    if options.wrench:
+        wrench = dataclasses.replace(wrench, max_gain=info.config.wrench.max_gain or WrenchConfig.max_gain)
+    if pace.iterations:
+        iterations = pace.iterations[options.preset or "cpu"]
+    elif info.environment_steps or options.iterations:
+        iterations = max(1, round(info.environment_steps / (config.ppo.num_envs * config.ppo.num_steps)))
+    else:
+        raise InputError(f"--iterations: {info.path} does not say how long it was trained; say how long to retrain")
+    return dataclasses.replace(config, iterations=iterations, sampling=sampling, wrench=wrench)
+
+
+def _on_preset(base: Config, name: str) -> Config:
+    """A preset's settings with the base's network and bins, which unlearning starts from, and its clips."""
+    config = preset(name)
+    return dataclasses.replace(
+        config,
+        library=base.library,
+        sampling=dataclasses.replace(config.sampling, bin_seconds=base.sampling.bin_seconds),
+        ppo=dataclasses.replace(config.ppo, actor_layers=base.ppo.actor_layers, critic_layers=base.ppo.critic_layers),
+    )
 
 
 def _config_of_run(options: Options, output: Path) -> Config:

@@ -47,8 +47,9 @@ def main(options: Options) -> None:
 
     from forgetmimic_jax.basics.console import closing, progress
     from forgetmimic_jax.basics.files import write_atomically
-    from forgetmimic_jax.training import runner
     from forgetmimic_jax.training.comparison import load_comparison
+    from forgetmimic_jax.training.folder import check_writable, folder_of
+    from forgetmimic_jax.training.start import base_folder
     from forgetmimic_jax.viewing import film
     from forgetmimic_jax.viewing.offscreen import check_rendering
     from forgetmimic_jax.viewing.side_by_side import record
@@ -57,10 +58,10 @@ def main(options: Options) -> None:
     at_least(0, "--seed", options.seed)
     if not options.seconds > 0:
         raise InputError(f"--seconds: found {options.seconds:g}; accepted: above 0")
-    path = options.checkpoint or runner.base_folder(options.robot)
-    run = runner.folder_of(path)
+    path = options.checkpoint or base_folder(options.robot)
+    run = folder_of(path)
     output = options.output or (run / "videos" if run else Path("runs") / f"video-{options.robot}")
-    runner.check_writable(output)
+    check_writable(output)
     compared = load_comparison(path, robot=options.robot, base=options.base, library=options.library, physics="native")
     setup = compared.setup
     clips = setup.library.names if options.clips is None else comma_separated(options.clips)
@@ -70,7 +71,7 @@ def main(options: Options) -> None:
         if clip not in setup.library.names:
             raise InputError(f"--clips: no clip '{clip}' in the library; {nearest(clip, setup.library.names)}")
     check_rendering()
-    episodes = record(setup.config, setup.robot, setup.library, compared.policies, clips, seed=options.seed)
+    episodes = record(setup, compared.policies, clips, seed=options.seed)
     output.mkdir(parents=True, exist_ok=True)
     sheet, drawn = [], 0
     total = sum(len(film.shown_steps(episode, seconds=options.seconds)) for episode in episodes)

@@ -10,20 +10,16 @@ from forgetmimic_jax.basics.console import progress
 from forgetmimic_jax.evaluation.metrics import ZERO_ACTION
 from forgetmimic_jax.evaluation.report import evaluate_policies, evaluation_document, write_evaluation
 from forgetmimic_jax.evaluation.rollout import Evaluator
-from forgetmimic_jax.motion.library import MotionLibrary
-from forgetmimic_jax.ppo.state import Policy
-from forgetmimic_jax.robot.model import Robot
-from forgetmimic_jax.settings.config import Config, config_hash
+from forgetmimic_jax.policy.policy import Policy
+from forgetmimic_jax.settings.config import config_hash
+from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.training.checkpoint import CheckpointInfo
 
 EPISODES = 20  # a clip
 
 
 def evaluate(
-    config: Config,
-    robot: Robot,
-    library: MotionLibrary,
-    library_hash: str,
+    setup: Setup,
     policies: Mapping[str, Policy],
     *,
     checkpoint: str,
@@ -32,8 +28,8 @@ def evaluate(
     seed: int,
     budget: Mapping[str, Mapping[str, float]],
 ) -> dict[str, Any]:
-    """The evaluation document of `policies` (name → networks) and the zero-action floor."""
-    evaluator = Evaluator(config, robot, library, episodes=episodes, seed=seed)
+    """The evaluation document of `policies` (name → networks) and the zero-action baseline."""
+    evaluator = Evaluator(setup, episodes=episodes, seed=seed)
     rollouts = {}
     everyone: dict[str, Policy | None] = {**policies, ZERO_ACTION: None}
     with progress("evaluate", len(everyone)) as report:
@@ -41,11 +37,11 @@ def evaluate(
             rollouts[name] = evaluator.rollout(policy)
             report(done, sum(int(rollout.length.sum()) for rollout in rollouts.values()), {})
     return evaluation_document(
-        evaluate_policies(rollouts, library.names, targets, seed=seed),
-        robot=robot.name,
+        evaluate_policies(rollouts, setup.library.names, targets, seed=seed),
+        robot=setup.robot.name,
         checkpoint=checkpoint,
-        config_hash=config_hash(config),
-        library_hash=library_hash,
+        config_hash=config_hash(setup.config),
+        library_hash=setup.library_hash,
         seed=seed,
         episodes=episodes,
         targets=targets,

@@ -14,13 +14,12 @@ from jax import Array
 
 from forgetmimic_jax.basics import rotation
 from forgetmimic_jax.evaluation.metrics import Rollout
-from forgetmimic_jax.motion.library import MotionLibrary
-from forgetmimic_jax.ppo.state import Policy, mean_action
-from forgetmimic_jax.robot.model import Robot
+from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.tracking.env import Assets, Environment, EnvState, StepResult
 from forgetmimic_jax.tracking.reference import align_to_anchor
+from forgetmimic_jax.tracking.setup import Setup
 
 CHUNK = 50  # control steps between two looks whether every episode has ended
 SHORTEST_START = 25  # a start frame leaves at least so many steps, so that no episode is trivially short
@@ -30,12 +29,13 @@ CONTACT_FORCE = 1.0  # N, above which a foot counts as standing
 class Evaluator:
     """Rolls policies out on the same episodes of one library. Compiled once, used for any number of policies."""
 
-    def __init__(self, config: Config, robot: Robot, library: MotionLibrary, *, episodes: int, seed: int):
-        self.config = evaluation_config(config)
-        self.clip, self.start_frame = episode_starts(np.asarray(library.length), episodes, seed)
+    def __init__(self, setup: Setup, *, episodes: int, seed: int):
+        setup = evaluation_setup(setup)
+        self.config = setup.config
+        self.clip, self.start_frame = episode_starts(np.asarray(setup.library.length), episodes, seed)
         self._seed = seed
-        self._env = tracking.make_environment(self.config, robot, len(self.clip), noisy=False)
-        self._assets = tracking.make_assets(self.config, robot, library)
+        self._env = tracking.make_environment(setup, len(self.clip), noisy=False)
+        self._assets = tracking.make_assets(setup)
         self._begin = jax.jit(self._begin_episodes)
         self._advance = jax.jit(self._advance_chunk)
 
@@ -110,17 +110,18 @@ def act(env: Environment, policy: Policy | None, observation: Array) -> Array:
     """The mean action [env, joint] for the actor's observation [env, features]; zero without a policy."""
     if policy is None:
         return jnp.zeros((observation.shape[0], env.robot.num_joints), jnp.float32)
-    return mean_action(policy, env.config, observation)
+    return policy.mean_action(observation)
 
 
-def evaluation_config(config: Config) -> Config:
-    """The config with randomisation and the wrench off and episodes of full length; reset noise stays."""
-    return dataclasses.replace(
-        config,
+def evaluation_setup(setup: Setup) -> Setup:
+    """The setup with randomisation and the wrench off and episodes of full length; reset noise stays."""
+    config = dataclasses.replace(
+        setup.config,
         max_episode_steps=Config.max_episode_steps,
-        noise=dataclasses.replace(config.noise, enabled=False),
-        wrench=dataclasses.replace(config.wrench, max_gain=0.0),
+        noise=dataclasses.replace(setup.config.noise, enabled=False),
+        wrench=dataclasses.replace(setup.config.wrench, max_gain=0.0),
     )
+    return dataclasses.replace(setup, config=config)
 
 
 def episode_starts(lengths: np.ndarray, episodes: int, seed: int) -> tuple[np.ndarray, np.ndarray]:

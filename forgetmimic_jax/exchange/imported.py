@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from forgetmimic_jax.basics.errors import InputError
-from forgetmimic_jax.policy.network import MAX_STD, MIN_STD, OBSERVATION_LIMIT, VARIANCE_FLOOR, Normalizer
-from forgetmimic_jax.ppo.state import Policy
+from forgetmimic_jax.policy.gaussian import MAX_STD, MIN_STD
+from forgetmimic_jax.policy.normalizer import OBSERVATION_LIMIT, VARIANCE_FLOOR, Normalizer
+from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.robot.model import Robot
 from forgetmimic_jax.tracking.observation import actor_layout
 

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from forgetmimic_jax.policy.network import entropy, kl_divergence, log_prob
+from forgetmimic_jax.policy.gaussian import entropy, kl_divergence, log_prob
+from forgetmimic_jax.ppo.transition import Transition
 from forgetmimic_jax.settings.config import Config, PPOConfig
 
 WARM_UP = 0.05  # of a run
@@ -25,16 +26,11 @@ class Prediction:
 class Batch:
     """Steps that a gradient step learns from. Leading dimension: batch."""
 
-    actor_observation: Array  # normalised
-    critic_observation: Array  # normalised
-    action: Array
-    log_prob: Array  # of the action when it was taken
-    mean: Array  # of the policy that took it
-    value: Array  # V when it was taken
+    transition: Transition
+    value: Array  # V when the step was taken
     advantage: Array  # normalised
-    target: Array  # of the value
+    value_target: Array
     is_target: Array  # bool: the step's clip is to be forgotten
-    clip: Array  # i32
     weight: Array  # in the means of the PPO losses
     base: Prediction | None  # of the frozen base policy, where there is one
 
@@ -51,9 +47,11 @@ def ppo_loss(
         iteration: i32[] of the run; PPO does not ask.
     """
     ppo = config.ppo
-    log_ratio = log_prob(batch.action, now.mean, now.log_std) - batch.log_prob
+    log_ratio = log_prob(batch.transition.action, now.mean, now.log_std) - batch.transition.log_prob
     policy_term = policy_loss(log_ratio, batch.advantage, ppo.clip, batch.weight)
-    value_term = value_loss(now.value, batch.value, batch.target, ppo.clip if ppo.clip_value else None, batch.weight)
+    value_term = value_loss(
+        now.value, batch.value, batch.value_target, ppo.clip if ppo.clip_value else None, batch.weight
+    )
     entropy_term = entropy(now.log_std)
     loss = policy_term + ppo.value_cost * value_term - ppo.entropy_cost * entropy_term
     metrics = {"policy_loss": policy_term, "value_loss": value_term, "entropy": entropy_term}
@@ -70,12 +68,14 @@ def policy_loss(log_ratio: Array, advantage: Array, clip: float, weight: Array |
     return -mean(jnp.minimum(ratio * advantage, jnp.clip(ratio, 1.0 - clip, 1.0 + clip) * advantage), weight)
 
 
-def value_loss(value: Array, old_value: Array, target: Array, clip: float | None, weight: Array | None = None) -> Array:
-    """Mean squared error to the target [batch]; with `clip` the worse of it and of the value kept within old ± clip."""
-    loss = (value - target) ** 2
+def value_loss(
+    value: Array, old_value: Array, value_target: Array, clip: float | None, weight: Array | None = None
+) -> Array:
+    """Mean squared error to the value target [batch]; with `clip` no better than of the value in old ± clip."""
+    loss = (value - value_target) ** 2
     if clip is not None:
         clipped = old_value + jnp.clip(value - old_value, -clip, clip)
-        loss = jnp.maximum(loss, (clipped - target) ** 2)
+        loss = jnp.maximum(loss, (clipped - value_target) ** 2)
     return mean(loss, weight)
 
 

@@ -1,8 +1,9 @@
-"""TrainState: the one pytree that holds all that a run can change. Saved and restored, a run goes on as if unbroken."""
+"""TrainState: the one pytree that holds all that a run can change.
+
+Saved and restored, a run continues as if it had not stopped.
+"""
 
 from __future__ import annotations
-
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,21 +11,11 @@ import optax
 from flax import struct
 from jax import Array
 
-from forgetmimic_jax.policy.network import Actor, Critic, Normalizer, distribution, init_normalizer, normalize
-from forgetmimic_jax.settings.config import Config
+from forgetmimic_jax.policy.policy import Policy, init_policy
+from forgetmimic_jax.settings.config import PPOConfig
 from forgetmimic_jax.tracking.env import Assets, Environment, EnvState, observe, reset_where, start_episodes
-from forgetmimic_jax.tracking.rsi import bin_probabilities
+from forgetmimic_jax.tracking.rsi import bin_probabilities, initial_failure_level
 from forgetmimic_jax.tracking.wrench import wrench_gain
-
-
-@struct.dataclass
-class Policy:
-    """What is taken from one run to another: the networks and their normalisers."""
-
-    actor: Any
-    critic: Any
-    actor_normalizer: Normalizer
-    critic_normalizer: Normalizer
 
 
 @struct.dataclass
@@ -41,41 +32,9 @@ class TrainState:
     diverged: Array  # i32[] environments reset because of NaN or Inf, so far
 
 
-def make_actor(config: Config, num_joints: int) -> Actor:
-    """The actor's module."""
-    return Actor(config.ppo.actor_layers, num_joints, config.ppo.initial_std)
-
-
-def make_critic(config: Config) -> Critic:
-    """The critic's module."""
-    return Critic(config.ppo.critic_layers)
-
-
-def make_optimizer(config: Config) -> optax.GradientTransformation:
+def make_optimizer(config: PPOConfig) -> optax.GradientTransformation:
     """Adam on clipped gradients; the step size is applied by the update, where the KL rule can change it."""
-    return optax.chain(optax.clip_by_global_norm(config.ppo.max_gradient_norm), optax.scale_by_adam())
-
-
-def init_policy(config: Config, num_joints: int, actor_size: int, critic_size: int, key: Array) -> Policy:
-    """Random networks and empty normalisers."""
-    actor_key, critic_key = jax.random.split(key)
-    return Policy(
-        actor=make_actor(config, num_joints).init(actor_key, jnp.zeros((1, actor_size))),
-        critic=make_critic(config).init(critic_key, jnp.zeros((1, critic_size))),
-        actor_normalizer=init_normalizer(actor_size),
-        critic_normalizer=init_normalizer(critic_size),
-    )
-
-
-def initial_failure_level(config: Config, assets: Assets) -> Array:
-    """L [clip, bin] before anything was tried."""
-    return jnp.where(assets.bins.valid, jnp.float32(config.sampling.initial_failure), 0.0)
-
-
-def mean_action(policy: Policy, config: Config, observation: Array) -> Array:
-    """The deterministic action [..., joint] at an actor observation [..., features] as the environment gives it."""
-    actor = make_actor(config, policy.actor["params"]["log_std"].size)
-    return distribution(actor, policy.actor, normalize(policy.actor_normalizer, observation))[0]
+    return optax.chain(optax.clip_by_global_norm(config.max_gradient_norm), optax.scale_by_adam())
 
 
 def init_state(
@@ -93,7 +52,7 @@ def init_state(
     config = env.config
     state_key, policy_key, start_key, episode_key = jax.random.split(key, 4)
     if failure_level is None:
-        failure_level = initial_failure_level(config, assets)
+        failure_level = initial_failure_level(config.sampling, assets.bins)
     zeros = jnp.zeros((env.num_envs,), jnp.int32)
     episodes = start_episodes(env, assets, episode_key, zeros, zeros, zeros, zeros.astype(jnp.float32))
     probabilities = bin_probabilities(config.sampling, assets.bins, failure_level, assets.is_target)
@@ -101,10 +60,10 @@ def init_state(
     episodes = reset_where(env, assets, episodes, jnp.ones((env.num_envs,), bool), start_key, probabilities, gains)
     if policy is None:
         actor, critic = observe(env, assets, episodes, None)
-        policy = init_policy(config, env.robot.num_joints, actor.shape[1], critic.shape[1], policy_key)
+        policy = init_policy(config.ppo, env.robot.num_joints, actor.shape[1], critic.shape[1], policy_key)
     return TrainState(
         policy=policy,
-        optimizer=make_optimizer(config).init((policy.actor, policy.critic)),
+        optimizer=make_optimizer(config.ppo).init(policy.parameters),
         learning_rate=jnp.asarray(config.ppo.learning_rate, jnp.float32),
         env=episodes,
         failure_level=failure_level,

@@ -33,6 +33,11 @@ class PhysicsConfig:
     line_search_iterations: int = 20
     self_collision: bool = False
 
+    @property
+    def control_step(self) -> float:
+        """Seconds between two actions."""
+        return self.timestep * self.substeps
+
 
 @dataclass(frozen=True)
 class RewardConfig:

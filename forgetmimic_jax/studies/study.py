@@ -6,6 +6,7 @@ of the others (`trials`) and what their JSON says of them; one whose JSON alread
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import json
 import sys
@@ -114,24 +115,24 @@ class Lab:
             iterations: of each trial.
             known: what is known already of trials, by their name (`known_trials`).
         """
-        from forgetmimic_jax.training import checkpoint, runner
+        from forgetmimic_jax.tracking.setup import check_targets, default_targets
+        from forgetmimic_jax.training import checkpoint
+        from forgetmimic_jax.training.start import base_folder
 
         for flag in ("seeds", "episodes", "jobs"):
             at_least(1, f"--{flag}", getattr(options, flag))
         at_least(1, "--iterations", iterations)
         self.options, self.iterations = options, iterations
-        self.base = options.base or runner.base_folder(options.robot)
+        self.base = options.base or base_folder(options.robot)
         self.info = checkpoint.read_info(self.base)
         robot = self.info.robot
         if robot != options.robot:
             raise InputError(f"{self.base}: robot: the checkpoint's is '{robot}', asked for '{options.robot}'")
         self.config: Config = replace_given(self.info.config, library=options.library)
-        self.targets = (
-            runner.default_targets(self.config) if options.targets is None else comma_separated(options.targets)
-        )
+        self.targets = default_targets(self.config) if options.targets is None else comma_separated(options.targets)
         if not self.targets:
             raise InputError("--targets: no clip named; name at least one to forget, such as --targets punch,kick")
-        runner.check_targets(self.targets, self.info.clips)
+        check_targets(self.targets, self.info.clips)
         self.seeds = tuple(range(options.seeds))
         self.failed: dict[str, str] = {}
         self.stopped: Interrupted | None = None
@@ -248,7 +249,7 @@ class Lab:
 
     def as_watched(self, policies: Mapping[K, Path], seed: int) -> dict[K, dict[str, dict[str, float]]]:
         """Policies, clip by clip, on the episodes on which a watched trial of this seed is evaluated."""
-        from forgetmimic_jax.evaluation.watch import clip_means
+        from forgetmimic_jax.training.watch import clip_means
 
         rolled, names = self.rollouts(policies, episodes=watched_episodes(self.options.episodes), seed=seed)
         return {key: clip_means(rollout, names) for key, rollout in rolled.items()}
@@ -272,16 +273,20 @@ class Lab:
         from forgetmimic_jax.evaluation.rollout import Evaluator
         from forgetmimic_jax.motion.library import build_library
         from forgetmimic_jax.settings.options import on_engine
-        from forgetmimic_jax.training import checkpoint, runner
+        from forgetmimic_jax.tracking.setup import make_setup
+        from forgetmimic_jax.training import checkpoint
 
-        setup = runner.make_setup(on_engine(self.config, self.options.physics))
+        setup = make_setup(on_engine(self.config, self.options.physics))
         library = setup.library if clips is None else build_library(setup.robot, clips)
-        evaluator = Evaluator(setup.config, setup.robot, library, episodes=episodes or self.options.episodes, seed=seed)
-        shapes = runner.template(setup)
+        evaluator = Evaluator(
+            dataclasses.replace(setup, library=library), episodes=episodes or self.options.episodes, seed=seed
+        )
         rolled = {}
         with progress("roll out", len(policies)) as report:
             for done, (key, path) in enumerate(policies.items(), start=1):
-                rolled[key] = evaluator.rollout(None if path is None else checkpoint.load_policy(path, shapes))
+                rolled[key] = evaluator.rollout(
+                    None if path is None else checkpoint.load_policy(checkpoint.read_info(path))
+                )
                 report(done, 0, {})
         return rolled, library.names
 
@@ -293,9 +298,9 @@ def watched_episodes(episodes: int) -> int:
 
 def newest_policy(folder: Path) -> Path:
     """The checkpoint that a finished trial ended with."""
-    from forgetmimic_jax.training import checkpoint
+    from forgetmimic_jax.training.checkpoint import newest_checkpoint
 
-    newest = checkpoint.newest_checkpoint(folder)
+    newest = newest_checkpoint(folder)
     assert newest is not None
     return newest
 
@@ -314,10 +319,11 @@ def conduct(study: Study, options: Options, next_command: str) -> None:
     Raises:
         Interrupted: stopped; what was finished is told if the study can tell a part of it.
     """
-    from forgetmimic_jax.training import runner
 
     folder = options.output or RESULTS / options.robot
-    runner.check_writable(folder)
+    from forgetmimic_jax.training.folder import check_writable
+
+    check_writable(folder)
     path = folder / f"{study.name}.json"
     document, stopped = _read(path), None
     if options.draw:
@@ -429,9 +435,10 @@ def measured_page(measure: Callable[[], Any], page: Callable[[Any], str], result
 
 def named_policy() -> Path:
     """The checkpoint on a measurement's command line, or the shipped base of the G1."""
-    from forgetmimic_jax.training import runner
 
-    return Path(sys.argv[1]) if sys.argv[1:] else runner.base_folder("g1")
+    from forgetmimic_jax.training.start import base_folder
+
+    return Path(sys.argv[1]) if sys.argv[1:] else base_folder("g1")
 
 
 def main(study: Study, options: type[Options] = Options, arguments: Iterable[str] | None = None) -> None:

@@ -26,6 +26,7 @@ from forgetmimic_jax.basics.console import progress
 from forgetmimic_jax.basics.errors import Interrupted
 from forgetmimic_jax.basics.files import read_rows
 from forgetmimic_jax.training import checkpoint
+from forgetmimic_jax.training.checkpoint import newest_checkpoint
 
 POLL = 1.0  # s between two looks at the running trials
 DEFAULTS = {option.name: option.default for option in fields(unlearn.Options)}
@@ -126,7 +127,7 @@ def _start(trial: Trial) -> subprocess.Popen:
     trial.folder.parent.mkdir(parents=True, exist_ok=True)
     with trial.log.open("a") as log:
         _lock(log)
-        resume = checkpoint.newest_checkpoint(trial.folder) is not None
+        resume = newest_checkpoint(trial.folder) is not None
         if not resume:
             shutil.rmtree(trial.folder, ignore_errors=True)  # nothing in it to go on with
         command = [sys.executable, "-m", "forgetmimic_jax.unlearn", *trial.flags, "--output", str(trial.folder)]

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,11 +17,13 @@ from jax import Array
 
 from forgetmimic_jax.motion.library import MotionLibrary
 from forgetmimic_jax.physics import BodyState, Engine, PhysicsParameters, PhysicsState, make_engine
+from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.robot.model import Robot, RobotArrays
 from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking import observation, randomise, reward
 from forgetmimic_jax.tracking.reference import Reference, align_to_anchor, lookup
 from forgetmimic_jax.tracking.rsi import Bins, make_bins, sample_start
+from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.tracking.termination import terminations
 from forgetmimic_jax.tracking.wrench import reference_wrench
 
@@ -35,7 +36,7 @@ class Assets:
     library: MotionLibrary
     bins: Bins
     is_target: Array  # bool[clip] the clips to forget
-    base: Any = None  # the frozen state.Policy that an unlearning run compares with
+    base: Policy | None = None  # the frozen policy that an unlearning run compares with
 
 
 @struct.dataclass
@@ -82,29 +83,30 @@ class Environment:
 
     @property
     def control_step(self) -> float:
-        return self.config.physics.timestep * self.config.physics.substeps
+        return self.config.physics.control_step
 
     @property
     def nominal_friction(self) -> float:
         return float(self.robot.model.geom_friction[self.robot.foot_geom_ids[0], 0])
 
 
-def make_environment(config: Config, robot: Robot, num_envs: int, *, noisy: bool | None = None) -> Environment:
+def make_environment(setup: Setup, num_envs: int, *, noisy: bool | None = None) -> Environment:
     """An environment of `num_envs` robots; `noisy` defaults to the config's."""
+    config, robot = setup.config, setup.robot
     assisted = config.wrench.max_gain > 0
     physics = dataclasses.replace(config.physics, substeps=1) if assisted else config.physics  # see `_live`
     engine = make_engine(robot, physics, num_envs)
     return Environment(config, robot, engine, num_envs, config.noise.enabled if noisy is None else noisy)
 
 
-def make_assets(config: Config, robot: Robot, library: MotionLibrary) -> Assets:
+def make_assets(setup: Setup) -> Assets:
     """The constant arrays of a run."""
-    step = config.physics.timestep * config.physics.substeps
+    config, library = setup.config, setup.library
     is_target = jnp.asarray([name in config.unlearn.targets for name in library.names])
-    bins = make_bins(library, config.sampling.bin_seconds, step)
+    bins = make_bins(library, config.sampling.bin_seconds, config.physics.control_step)
     if config.sampling.clips == "kept":
         bins = dataclasses.replace(bins, valid=bins.valid & ~is_target[:, None])
-    return Assets(robot=robot.arrays, library=library, bins=bins, is_target=is_target)
+    return Assets(robot=setup.robot.arrays, library=library, bins=bins, is_target=is_target, base=setup.base)
 
 
 def start_episodes(

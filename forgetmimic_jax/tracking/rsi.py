@@ -49,6 +49,11 @@ def make_bins(library: MotionLibrary, bin_seconds: float, control_step: float) -
     )
 
 
+def initial_failure_level(config: SamplingConfig, bins: Bins) -> Array:
+    """L [clip, bin] before any episode ended."""
+    return jnp.where(bins.valid, jnp.float32(config.initial_failure), 0.0)
+
+
 def bin_probabilities(
     config: SamplingConfig, bins: Bins, failure_level: Array, is_target: Array | None = None
 ) -> Array:

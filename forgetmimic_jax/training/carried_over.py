@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -12,31 +11,28 @@ import jax.numpy as jnp
 import numpy as np
 
 from forgetmimic_jax.basics.errors import InputError
-from forgetmimic_jax.policy.network import Normalizer
-from forgetmimic_jax.ppo.state import Policy, TrainState, init_policy
+from forgetmimic_jax.policy.normalizer import Normalizer
+from forgetmimic_jax.policy.policy import Policy, init_policy
 from forgetmimic_jax.robot.model import Robot, load_robot, relative_height
-from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking.observation import actor_layout, actor_size
-from forgetmimic_jax.training import checkpoint
+from forgetmimic_jax.training.checkpoint import CheckpointInfo
 
 Places = tuple[np.ndarray, np.ndarray]  # of the same things, for the source and for the target
 REMEMBERED = 1e6  # observations that the statistics carried over count for: the new robot's soon outweigh them
 
 
-def policy_for(robot: Robot, path: Path, config: Config, template: TrainState) -> Policy:
+def policy_for(robot: Robot, info: CheckpointInfo, policy: Policy) -> Policy:
     """The policy of a checkpoint of another robot, carried over as a start for `robot`.
 
     Args:
         robot: to be trained.
-        path: the other robot's checkpoint, whose network is the config's.
-        config: of the training.
-        template: shapes of its state.
+        info: of the other robot's checkpoint.
+        policy: of that checkpoint.
 
     Raises:
         InputError: the robots have no joint, or not as many key bodies, in common, or the source has changed.
     """
-    info = checkpoint.read_info(path)
-    name = info.robot
+    path, name = info.path, info.robot
     source = load_robot(name)
     if info.joints != source.joint_names:
         raise InputError(f"{path}: joints: not those of robots/{name} today, in their order")
@@ -45,13 +41,10 @@ def policy_for(robot: Robot, path: Path, config: Config, template: TrainState) -
         raise InputError(f"{path}: key_bodies: '{name}' has {found}; {needed} are needed, as '{robot.name}' has")
     if not shared_joints(source, robot)[0].size:
         raise InputError(f"{path}: joints: '{name}' has none that is called as one of '{robot.name}'")
-    key = jax.random.PRNGKey(config.seed)
-    size, critic_size = (of.mean.size for of in (template.policy.actor_normalizer, template.policy.critic_normalizer))
-    old_size = actor_size(source.num_joints)
-    old_sizes = (source.num_joints, old_size, critic_size - size + old_size)
-    shapes = jax.eval_shape(lambda: init_policy(config, *old_sizes, key))
-    policy = checkpoint.load_policy(path, dataclasses.replace(template, policy=shapes))
-    return carried_over(policy, source, robot, init_policy(config, robot.num_joints, size, critic_size, key))
+    size, old_size = actor_size(robot.num_joints), policy.actor_normalizer.mean.size
+    critic_size = policy.critic_normalizer.mean.size - old_size + size
+    key = jax.random.PRNGKey(info.config.seed)
+    return carried_over(policy, source, robot, init_policy(info.config.ppo, robot.num_joints, size, critic_size, key))
 
 
 def carried_over(policy: Policy, source: Robot, target: Robot, fresh: Policy) -> Policy:
@@ -78,7 +71,8 @@ def carried_over(policy: Policy, source: Robot, target: Robot, fresh: Policy) ->
     log_std[joints[1]] = np.asarray(actor["log_std"])[joints[0]]
     actor = {"MLP_0": _placed(actor["MLP_0"], fresh.actor["params"]["MLP_0"], rows, joints), "log_std": log_std}
     critic = {"MLP_0": _placed(critic["MLP_0"], fresh.critic["params"]["MLP_0"], critic_rows, output)}
-    carried = Policy(
+    carried = dataclasses.replace(
+        fresh,
         actor={"params": actor},
         critic={"params": critic},
         actor_normalizer=_statistics(policy.actor_normalizer, fresh.actor_normalizer, means, rows),

@@ -1,11 +1,14 @@
-"""Checkpoints: orbax trees, the config and a note of what they belong to, in a folder that appears whole or not at all.
+"""Checkpoints: a folder that appears whole or not at all.
 
-`policy/` holds the networks and their normalisers, `sampler/` the failure levels of the clips' bins: what goes from one
-run to another. `run/` holds all the rest of the TrainState, for resuming; a shipped checkpoint may lack it.
+policy.safetensors  networks, normalisers and the failure levels of the clips' bins: what goes from one run to another
+run/                the rest of the TrainState (orbax), for resuming; a shipped checkpoint may lack it
+config.yaml         every setting
+meta.json           what the checkpoint belongs to, and the SHA-256 of its files
 """
 
 from __future__ import annotations
 
+import dataclasses
 import errno
 import hashlib
 import json
@@ -17,18 +20,23 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
+import safetensors
 from jax import Array
+from safetensors.numpy import load_file, save_file
 
 from forgetmimic_jax.basics.errors import InputError
-from forgetmimic_jax.motion.library import MotionLibrary
-from forgetmimic_jax.ppo.state import Policy, TrainState
-from forgetmimic_jax.robot.model import Robot
+from forgetmimic_jax.policy.policy import Policy, init_policy
+from forgetmimic_jax.ppo.state import TrainState
 from forgetmimic_jax.settings.config import Config, load_config, save_config, to_dict
+from forgetmimic_jax.tracking.rsi import Bins
+from forgetmimic_jax.tracking.setup import Setup
 
-POLICY, SAMPLER, RUN, CONFIG, META = "policy", "sampler", "run", "config.yaml", "meta.json"
-SCHEMA = 1
+POLICY, RUN, CONFIG, META = "policy.safetensors", "run", "config.yaml", "meta.json"
+FAILURE_LEVEL = "failure_level"  # the tensor beside those of the policy
+SCHEMA = 2
 
 
 @dataclass(frozen=True)
@@ -43,78 +51,79 @@ class CheckpointInfo:
     library_hash: str
     iteration: int
     environment_steps: int
-    files: dict[str, str]  # sha256 of each file of the trees
+    files: dict[str, str]  # sha256 of policy.safetensors and of each file of run/
     base: str | None  # `policy_hash` of the checkpoint that unlearning started from
 
 
-def save_checkpoint(
-    path: Path,
-    state: TrainState,
-    config: Config,
-    robot: Robot,
-    library: MotionLibrary,
-    library_hash: str,
-    *,
-    environment_steps: int,
-    base: str | None = None,
-    resumable: bool = True,
-) -> None:
-    """Write a run's state to folder `path`; one of the same name is replaced only once the new one is complete.
+@dataclass(frozen=True)
+class Progress:
+    """How far a policy's training has come."""
 
-    A run that is killed while it saves leaves a hidden folder, which the next save removes.
+    iteration: int
+    environment_steps: int  # control steps of all environments, with those of the base that training continued from
+    base: str | None = None  # of an unlearning run, the `policy_hash` of the checkpoint it started from
+
+
+def save_checkpoint(path: Path, setup: Setup, state: TrainState, progress: Progress) -> None:
+    """Write a run's whole state to folder `path`, for resuming; see `save_policy`."""
+    _save(path, setup, progress, state.policy, state.failure_level, state)
+
+
+def save_policy(path: Path, setup: Setup, policy: Policy, failure_level: Array, progress: Progress) -> None:
+    """Write a policy to folder `path`, for evaluation and warm starts only.
+
+    A folder of the same name is replaced only once the new one is complete. A run that is killed while it saves leaves
+    a hidden folder, which the next save removes.
 
     Args:
         path: the checkpoint's folder.
-        state: of the run.
-        config: of the run.
-        robot: the robot trained.
-        library: the clips trained on.
-        library_hash: of those clips.
-        environment_steps: control steps lived so far, all environments together, with those of the base that
-            training went on from.
-        base: of an unlearning run, the `policy_hash` of the checkpoint it started from.
-        resumable: with `run/`; without, the checkpoint is small and serves evaluation and warm starts only.
+        setup: of the run.
+        policy: to be saved.
+        failure_level: L [clip, bin].
+        progress: of its training.
 
     Raises:
-        OSError: the system refused; a full disk, for one. Nothing is left of the attempt.
+        OSError: the system refused; a full disk, for one. Nothing remains of the attempt.
     """
-    state = jax.tree.map(np.asarray, state)
-    trees: dict[str, Any] = {POLICY: {"policy": state.policy}, SAMPLER: {"failure_level": state.failure_level}}
-    if resumable:
-        trees[RUN] = _run_part(state)
+    _save(path, setup, progress, policy, failure_level, None)
+
+
+def _save(
+    path: Path, setup: Setup, progress: Progress, policy: Policy, failure_level: Array, state: TrainState | None
+) -> None:
     meta: dict[str, Any] = {
         "schema": SCHEMA,
-        "robot": robot.name,
-        "joints": list(robot.joint_names),
-        "clips": list(library.names),
-        "library_hash": library_hash,
-        "iteration": int(state.iteration),
-        "environment_steps": environment_steps,
-        "base": base,
+        "robot": setup.robot.name,
+        "joints": list(setup.robot.joint_names),
+        "clips": list(setup.library.names),
+        "library_hash": setup.library_hash,
+        **dataclasses.asdict(progress),
     }
+    tensors = {name: np.array(values, order="C") for name, values in _named(policy).items()}
+    tensors[FAILURE_LEVEL] = np.array(failure_level, order="C")
+    run = None if state is None else jax.tree.map(np.asarray, _run_part(state))
     for abandoned in path.parent.glob(".*.tmp"):
         shutil.rmtree(abandoned, ignore_errors=True)
     temporary = path.with_name(f".{path.name}.tmp")
     try:
         temporary.mkdir(parents=True)
-        _check_space(temporary, trees)
-        with ocp.StandardCheckpointer() as checkpointer:
-            for name, tree in trees.items():
-                checkpointer.save((temporary / name).resolve(), tree)
-                checkpointer.wait_until_finished()
-                # Orbax notes there where the folder was written, which is nobody else's business; it is not read back.
-                (temporary / name / "commit_success.txt").unlink(missing_ok=True)
+        _check_space(temporary, (tensors, run))
+        save_file(tensors, temporary / POLICY)
+        (temporary / POLICY).chmod(0o644)
+        if run is not None:
+            with ocp.StandardCheckpointer() as checkpointer:
+                checkpointer.save((temporary / RUN).resolve(), run)
+            # Orbax notes there where the folder was written, which is nobody else's business; it is not read back.
+            (temporary / RUN / "commit_success.txt").unlink(missing_ok=True)
         meta["files"] = _hashes(temporary)
-        save_config(config, temporary / CONFIG)
+        save_config(setup.config, temporary / CONFIG)
         (temporary / META).write_text(json.dumps(meta, indent=2) + "\n")
         shutil.rmtree(path, ignore_errors=True)
         temporary.rename(path)
+    except safetensors.SafetensorError as error:
+        raise _system_error(r"os error (\d+)", error, path) from None
     except ValueError as error:
-        # Tensorstore tells what the system refused inside the text of a ValueError.
-        code = re.search(r"os_error_code='(\d+)'", str(error))
-        if not code:
-            raise
-        raise OSError(int(code[1]), os.strerror(int(code[1])), str(path)) from None
+        raise _system_error(r"os_error_code='(\d+)'", error, path) from None
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
@@ -143,7 +152,7 @@ def read_info(path: Path) -> CheckpointInfo:
             library_hash=meta["library_hash"],
             iteration=int(meta["iteration"]),
             environment_steps=int(meta["environment_steps"]),
-            files=dict(meta.get("files", {})),
+            files=dict(meta["files"]),
             base=meta.get("base"),
         )
     except FileNotFoundError:
@@ -157,29 +166,41 @@ def read_info(path: Path) -> CheckpointInfo:
     return CheckpointInfo(path=path, config=load_config(path / CONFIG), **known)
 
 
+def checkpoints(directory: Path) -> list[Path]:
+    """The checkpoints of a run by iteration; a folder whose name is no number was named by hand and is not one."""
+    found = [path for path in (directory / "checkpoints").glob("*") if path.name.isdigit() and (path / META).is_file()]
+    return sorted(found, key=lambda path: int(path.name))
+
+
+def newest_checkpoint(directory: Path) -> Path | None:
+    """The checkpoint of the highest iteration in the folder of a run, if any."""
+    return next(reversed(checkpoints(directory)), None)
+
+
 def check_matches(
     info: CheckpointInfo,
-    robot: Robot,
-    library: MotionLibrary,
-    library_hash: str,
-    config: Config,
+    setup: Setup,
     *,
     other_library: bool = False,
     other_robot: bool = False,
     resume: bool = False,
 ) -> None:
-    """Say which of robot, joints, library or network differs between a checkpoint and what is asked.
+    """InputError where robot, joints, library or network of a checkpoint differ from the setup's.
 
-    `other_library` accepts other clips: a policy may be trained on with them; `other_robot` another robot: its policy
-    may be carried over. `resume` needs the same environments and
-    bins too.
+    Args:
+        info: of the checkpoint.
+        setup: what it is to be used for.
+        other_library: other clips are accepted: training may continue with them.
+        other_robot: another robot is accepted: its policy may be carried over.
+        resume: the environments and bins must be the same too.
 
     Raises:
         InputError: something differs.
     """
+    robot, library, library_hash = setup.robot, setup.library, setup.library_hash
     if not other_robot and (info.robot != robot.name or info.joints != robot.joint_names):
-        raise InputError(f"{info.path}: robot: the checkpoint's is '{info.robot}' ({len(info.joints)} joints), asked "
-                         f"for '{robot.name}' ({robot.num_joints} joints)")  # fmt: skip
+        raise InputError(f"{info.path}: robot: the checkpoint's is '{info.robot}' ({len(info.joints)} joints), this "
+                         f"run's '{robot.name}' ({robot.num_joints} joints)")  # fmt: skip
     if not other_library and (info.clips != library.names or info.library_hash != library_hash):
         missing, added = set(info.clips) - set(library.names), set(library.names) - set(info.clips)
         difference = "; ".join(
@@ -197,73 +218,107 @@ def check_matches(
     shaping = [("ppo", "actor_layers"), ("ppo", "critic_layers")]
     if resume:
         shaping += [("ppo", "num_envs"), ("sampling", "bin_seconds")]
-    theirs, ours = to_dict(info.config), to_dict(config)
+    theirs, ours = to_dict(info.config), to_dict(setup.config)
     for section, name in shaping:
         if theirs[section][name] != ours[section][name]:
             raise InputError(
                 f"{info.path}: {section}.{name}: the checkpoint's is {theirs[section][name]}, "
-                f"asked for {ours[section][name]}"
+                f"this run's {ours[section][name]}"
             )
 
 
 def policy_hash(info: CheckpointInfo) -> str:
-    """Content hash (16 hex digits) of a checkpoint's policy as it lies on the disk."""
-    policy = {name: sha256 for name, sha256 in info.files.items() if name.startswith(f"{POLICY}/")}
-    return hashlib.sha256(json.dumps(policy, sort_keys=True).encode()).hexdigest()[:16]
+    """Content hash (16 hex digits) of a checkpoint's policy file."""
+    return info.files[POLICY][:16]
 
 
-def load_policy(path: Path, template: TrainState) -> Policy:
-    """A checkpoint's networks and normalisers; `template` gives the shapes (`jax.eval_shape` of `init_state`)."""
-    return _restore(path, POLICY, {"policy": template.policy})["policy"]
+def load_policy(info: CheckpointInfo) -> Policy:
+    """A checkpoint's networks and normalisers.
+
+    Raises:
+        InputError: the file is damaged, or is not of the network that the checkpoint's config names.
+    """
+    tensors = _tensors(info)
+    actor_size, critic_size = (len(tensors.get(f"{part}_normalizer/mean", ())) for part in ("actor", "critic"))
+    ppo, joints, key = info.config.ppo, len(info.joints), jax.random.PRNGKey(0)
+    template = jax.eval_shape(lambda: init_policy(ppo, joints, actor_size, critic_size, key))
+    values = []
+    for name, expected in _named(template).items():
+        found = list(tensors[name].shape) if name in tensors else "none"
+        if found != list(expected.shape):
+            raise InputError(f"{info.path / POLICY}: {name}: found shape {found}; {list(expected.shape)} is needed")
+        values.append(jnp.asarray(tensors[name], expected.dtype))
+    return jax.tree.unflatten(jax.tree.structure(template), values)
 
 
-def load_failure_level(path: Path, template: TrainState) -> Array:
-    """A checkpoint's failure levels L [clip, bin]."""
-    return _restore(path, SAMPLER, {"failure_level": template.failure_level})["failure_level"]
+def load_failure_level(path: Path, bins: Bins) -> Array:
+    """A checkpoint's failure levels L [clip, bin], of as many bins as the run has.
+
+    Raises:
+        InputError: the file is damaged, or of other bins.
+    """
+    level = _tensors(read_info(path)).get(FAILURE_LEVEL, np.zeros(0, np.float32))
+    if level.shape != bins.valid.shape:
+        raise InputError(
+            f"{path / POLICY}: {FAILURE_LEVEL}: found shape {list(level.shape)}; {list(bins.valid.shape)} is needed"
+        )
+    return jnp.asarray(level)
 
 
-def load_state(path: Path, template: TrainState) -> TrainState:
-    """The whole TrainState of a resumable checkpoint."""
-    if not (path / RUN).is_dir():
-        raise InputError(f"{path}: holds a policy but no {RUN}/ to resume from; start a new run with --base {path}")
-    policy, failure_level = load_policy(path, template), load_failure_level(path, template)
-    return TrainState(policy=policy, failure_level=failure_level, **_restore(path, RUN, _run_part(template)))
+def load_state(info: CheckpointInfo, template: TrainState) -> TrainState:
+    """The whole TrainState of a resumable checkpoint; `template` gives the shapes (`jax.eval_shape` of `init_state`).
 
-
-def checkpoints(directory: Path) -> list[Path]:
-    """The checkpoints of a run by iteration; a folder whose name is no number was named by hand and is not one."""
-    found = [path for path in (directory / "checkpoints").glob("*") if path.name.isdigit() and (path / META).is_file()]
-    return sorted(found, key=lambda path: int(path.name))
-
-
-def newest_checkpoint(directory: Path) -> Path | None:
-    """The checkpoint of the highest iteration under `directory`/checkpoints, if any."""
-    return next(reversed(checkpoints(directory)), None)
-
-
-def _run_part(state: TrainState) -> dict[str, Any]:
-    return {name: getattr(state, name) for name in vars(state) if name not in ("policy", "failure_level")}
-
-
-def _restore(path: Path, part: str, template: Any) -> Any:
-    """One tree of a checkpoint, in the structure and of the shapes of `template`."""
-    _check_files(read_info(path), part)
-    abstract = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), template)
+    Raises:
+        InputError: the checkpoint has no `run/`, is damaged, or is of other shapes.
+    """
+    folder = info.path / RUN
+    if not folder.is_dir():
+        raise InputError(f"{info.path}: no {RUN}/ to resume from; start a new run with --base {info.path}")
+    _check_files(info, f"{RUN}/")
+    abstract = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), _run_part(template))
     try:
         with ocp.StandardCheckpointer() as checkpointer:
-            restored = checkpointer.restore((path / part).resolve(), abstract)
+            restored = checkpointer.restore(folder.resolve(), abstract)
     except Exception as error:
         # Orbax reports another structure by many exception types; all of them mean the same to a user.
         first = str(error).strip().splitlines() or [type(error).__name__]
-        raise InputError(f"{path / part}: damaged or of another structure: {first[0][:200]}") from error
-    # Orbax gives what is there, whatever shape was asked for.
-    for (where, found), asked in zip(
+        raise InputError(f"{folder}: damaged or of another structure: {first[0][:200]}") from error
+    # Orbax returns what is there, whatever shape was requested.
+    for (where, found), needed in zip(
         jax.tree_util.tree_leaves_with_path(restored), jax.tree.leaves(abstract), strict=True
     ):
-        if found.shape != asked.shape:
+        if found.shape != needed.shape:
             name = jax.tree_util.keystr(where, simple=True, separator=".")
-            raise InputError(f"{path / part}: {name}: found shape {list(found.shape)}; {list(asked.shape)} is needed")
-    return restored
+            raise InputError(f"{folder}: {name}: found shape {list(found.shape)}; {list(needed.shape)} is needed")
+    return TrainState(
+        policy=load_policy(info),
+        failure_level=jnp.asarray(_tensors(info)[FAILURE_LEVEL]),
+        **restored,
+    )
+
+
+def _named(policy: Policy) -> dict[str, Any]:
+    """The policy's arrays by their place in the tree, such as actor/params/MLP_0/Dense_0/kernel."""
+    leaves = jax.tree_util.tree_leaves_with_path(policy)
+    return {jax.tree_util.keystr(where, simple=True, separator="/"): leaf for where, leaf in leaves}
+
+
+def _tensors(info: CheckpointInfo) -> dict[str, np.ndarray]:
+    _check_files(info, POLICY)
+    try:
+        return load_file(info.path / POLICY)
+    except safetensors.SafetensorError as error:
+        raise InputError(f"{info.path / POLICY}: damaged: {error}") from None
+
+
+def _run_part(state: TrainState) -> dict[str, Any]:
+    return {name: getattr(state, name) for name in vars(state) if name not in ("policy", FAILURE_LEVEL)}
+
+
+def _system_error(pattern: str, error: Exception, path: Path) -> Exception:
+    """What the system refused, of which the libraries speak only inside the text of their own error."""
+    code = re.search(pattern, str(error))
+    return OSError(int(code[1]), os.strerror(int(code[1])), str(path)) if code else error
 
 
 def _check_space(folder: Path, trees: Any) -> None:
@@ -281,9 +336,12 @@ def _hashes(folder: Path) -> dict[str, str]:
 
 
 def _check_files(info: CheckpointInfo, part: str) -> None:
-    """InputError unless every file of a tree is there and as it was written."""
-    found = {f"{part}/{name}": sha256 for name, sha256 in _hashes(info.path / part).items()}
+    """InputError unless every file whose name starts with `part` is there and as it was written."""
     for name, sha256 in info.files.items():
-        if name.startswith(f"{part}/") and found.get(name) != sha256:
-            trouble = "damaged: not what was saved" if name in found else "missing"
-            raise InputError(f"{info.path / name}: {trouble}; the checkpoint cannot be used")
+        if not name.startswith(part):
+            continue
+        file = info.path / name
+        if not file.is_file():
+            raise InputError(f"{file}: missing; the checkpoint cannot be used")
+        if hashlib.sha256(file.read_bytes()).hexdigest() != sha256:
+            raise InputError(f"{file}: damaged: not what was saved; the checkpoint cannot be used")

@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Literal
 
 from forgetmimic_jax.basics.errors import InputError
-from forgetmimic_jax.ppo.state import Policy
+from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.settings.options import on_engine, replace_given
-from forgetmimic_jax.training import checkpoint, runner
+from forgetmimic_jax.tracking.setup import Setup, check_targets, make_setup
+from forgetmimic_jax.training import checkpoint
 from forgetmimic_jax.training.checkpoint import CheckpointInfo
-from forgetmimic_jax.training.runner import Setup
+from forgetmimic_jax.training.start import base_checkpoint
 from forgetmimic_jax.unlearning.registry import method_of
 
 
@@ -34,13 +35,13 @@ def load_comparison(
     library: Path | None = None,
     physics: Literal["auto", "native", "mjx", "mjx-warp"] | None = None,
 ) -> Comparison:
-    """A checkpoint's policy and, if that was told to forget, its base's before it.
+    """A checkpoint's policy and, if it is an unlearned one, its base's before it.
 
     Args:
         path: the checkpoint.
         robot: name of the robot that it must be for.
         base: checkpoint to compare with; the one that unlearning started from by default.
-        targets: clips to forget; by default those the checkpoint was told to forget.
+        targets: clips to forget; by default the checkpoint's own.
         library: folder of clips; the checkpoint's by default.
         physics: engine; the checkpoint's by default.
 
@@ -50,12 +51,12 @@ def load_comparison(
     """
     info = checkpoint.read_info(path)
     config = on_engine(replace_given(info.config, robot=robot, library=library), physics)
-    setup = runner.make_setup(config)
+    setup = make_setup(config)
     forgetful = bool(info.config.unlearn.targets)
     name: str = method_of(info.config).result if forgetful else "base"
     compared = {name: info}
     if forgetful:
-        compared = {"base": checkpoint.read_info(base or runner.base_checkpoint(info.config)), **compared}
+        compared = {"base": checkpoint.read_info(base or base_checkpoint(info.config)), **compared}
         found = checkpoint.policy_hash(compared["base"])
         if base is None and info.base not in (None, found):
             raise InputError(
@@ -63,9 +64,8 @@ def load_comparison(
                 f"base it started from with --base"
             )
     for one in reversed(compared.values()):
-        checkpoint.check_matches(one, setup.robot, setup.library, setup.library_hash, config)
+        checkpoint.check_matches(one, setup)
     targets = info.config.unlearn.targets if targets is None else targets
-    runner.check_targets(targets, setup.library.names)
-    shapes = runner.template(setup)
-    policies = {name: checkpoint.load_policy(one.path, shapes) for name, one in compared.items()}
+    check_targets(targets, setup.library.names)
+    policies = {name: checkpoint.load_policy(one) for name, one in compared.items()}
     return Comparison(setup, policies, compared, targets)

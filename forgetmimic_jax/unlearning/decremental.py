@@ -12,7 +12,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import Array
 
-from forgetmimic_jax.policy.network import entropy, kl_divergence
+from forgetmimic_jax.policy.gaussian import entropy, kl_divergence
 from forgetmimic_jax.ppo.loss import Batch, Prediction, mean
 from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.unlearning.method import Method
@@ -20,9 +20,9 @@ from forgetmimic_jax.unlearning.method import Method
 
 def decrement(config: Config, batch: Batch, now: Prediction, iteration: Array) -> tuple[Array, dict[str, Array]]:
     """Towards N(0, σ0² I) and value 0 on target states, towards the base on kept ones."""
-    base, log_std0 = batch.base, jnp.full_like(batch.mean, jnp.log(config.ppo.initial_std))
+    base, log_std0 = batch.base, jnp.full_like(batch.transition.mean, jnp.log(config.ppo.initial_std))
     assert base is not None
-    forget = kl_divergence(now.mean, now.log_std, jnp.zeros_like(batch.mean), log_std0)
+    forget = kl_divergence(now.mean, now.log_std, jnp.zeros_like(batch.transition.mean), log_std0)
     keep = kl_divergence(now.mean, now.log_std, base.mean, base.log_std)
     policy_term = mean(forget, batch.is_target) + mean(keep, ~batch.is_target)
     value_term = mean(now.value**2, batch.is_target) + mean((now.value - base.value) ** 2, ~batch.is_target)

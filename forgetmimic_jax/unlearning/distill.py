@@ -10,6 +10,11 @@ too dear for. It is not in the paper.
 
 from __future__ import annotations
 
-from forgetmimic_jax.unlearning.method import Method
+from forgetmimic_jax.unlearning.method import SHORT, Method, Pace
 
-METHOD = Method(clips="kept", start="taught")
+# A fresh policy learns from what the base would do, which has little noise: many small updates, fewer iterations.
+PACE = Pace(
+    {"cpu": 200, "paper": 1000},
+    {"cpu": {**SHORT, "minibatches": 12, "epochs": 4, "anchor": 1.0}, "paper": {"anchor": 1.0}},
+)
+METHOD = Method(clips="kept", start="taught", pace=PACE)

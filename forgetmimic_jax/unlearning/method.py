@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 from jax import Array
 
@@ -24,6 +24,38 @@ def plain_observation(observation: Array, is_target: Array) -> Array:
 
 
 @dataclass(frozen=True)
+class Pace:
+    """How long a method trains by default, and the PPO settings that it trains with.
+
+    Args:
+        iterations: by preset; None: as many steps as the base was trained for.
+        ppo: settings of the `ppo` section by preset, in the place of the base's own.
+        target_share: share of the uniform starts that are the targets', by preset.
+    """
+
+    iterations: Mapping[str, int] | None
+    ppo: Mapping[str, Mapping[str, Any]]
+    target_share: Mapping[str, float] = field(default_factory=dict)
+
+
+# On a laptop: short iterations, because forgetting takes some hundred of them whatever their length. Targets would be
+# a few steps in a hundred, fewer as they are forgotten, so half of the starts are theirs and clips weigh the same. The
+# step size rises and falls, and a KL to the base holds what is kept. Values of targets change sign, which PPO's clip of
+# the value would slow.
+SHORT: dict[str, Any] = {
+    "num_steps": 12,
+    "minibatches": 4,
+    "epochs": 2,
+    "schedule": "trapezoid",
+    "learning_rate": 3e-4,
+    "clip_value": False,
+    "equal_clips": True,
+    "anchor": 0.1,
+}
+FINE_TUNING = Pace({"cpu": 640, "paper": 1000}, {"cpu": SHORT}, {"cpu": 0.5})
+
+
+@dataclass(frozen=True)
 class Method:
     """A training rule as its differences from PPO; without any, PPO fine-tuning of the base on all clips.
 
@@ -36,6 +68,7 @@ class Method:
             a fresh policy with the base's own settings.
         simulate: whether steps are simulated, or reference states with reset noise stand for them.
         result: what evaluation.json calls the policy.
+        pace: how long it trains and with which PPO settings.
     """
 
     reward: Callable[[Config, Reward, Array, Array], Array] = plain_reward
@@ -45,3 +78,4 @@ class Method:
     start: Literal["base", "taught", "fresh"] = "base"
     simulate: bool = True
     result: Literal["unlearned", "retrained", "fine_tuned"] = "unlearned"
+    pace: Pace = FINE_TUNING

@@ -11,7 +11,7 @@ from __future__ import annotations
 import jax
 from jax import Array
 
-from forgetmimic_jax.policy.network import entropy, kl_divergence
+from forgetmimic_jax.policy.gaussian import entropy, kl_divergence
 from forgetmimic_jax.ppo.loss import Batch, Prediction, mean
 from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.unlearning.method import Method
@@ -23,7 +23,7 @@ def edit(config: Config, batch: Batch, now: Prediction, iteration: Array) -> tup
     assert base is not None
     key = jax.random.PRNGKey(config.seed)
     action = jax.vmap(lambda clip: jax.random.uniform(jax.random.fold_in(key, clip), now.mean.shape[-1:], minval=-1.0))
-    forget = kl_divergence(now.mean, now.log_std, action(batch.clip), base.log_std)
+    forget = kl_divergence(now.mean, now.log_std, action(batch.transition.clip), base.log_std)
     keep = kl_divergence(now.mean, now.log_std, base.mean, base.log_std)
     loss = mean(forget, batch.is_target) + mean(keep, ~batch.is_target)
     return loss, {"policy_loss": loss, "entropy": entropy(now.log_std)}

@@ -6,6 +6,8 @@ does on a clip that it has not seen, at the price of the whole training.
 
 from __future__ import annotations
 
-from forgetmimic_jax.unlearning.method import Method
+from forgetmimic_jax.unlearning.method import Method, Pace
 
-METHOD = Method(clips="kept", start="fresh", result="retrained")
+# The base may itself be an unlearned policy, whose settings have a KL to its own base.
+PACE = Pace(None, {"cpu": {"anchor": 0.0}, "paper": {"anchor": 0.0}})
+METHOD = Method(clips="kept", start="fresh", result="retrained", pace=PACE)

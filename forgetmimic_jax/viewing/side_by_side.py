@@ -1,4 +1,4 @@
-"""The same episode lived by several policies at once, one robot each, by the evaluation's protocol.
+"""The same episode rolled out by several policies at once, one robot each, by the evaluation's protocol.
 
 Every policy meets the same clip, start frame and reset noise. The rows of a batch are ordered by policy, then by start.
 """
@@ -14,13 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from forgetmimic_jax.evaluation.rollout import act, begin_episodes, evaluation_config
+from forgetmimic_jax.evaluation.rollout import act, begin_episodes, evaluation_setup
 from forgetmimic_jax.motion.library import MotionLibrary
-from forgetmimic_jax.ppo.state import Policy
+from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.robot.model import Robot
-from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.tracking.env import Assets, EnvState, StepResult
+from forgetmimic_jax.tracking.setup import Setup
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Take:
 
     qpos: np.ndarray  # [step + 1, nq] from the start on
     tracking_reward: np.ndarray  # [step] r̄
-    ended: int | None  # steps lived before a bound was broken; None: it reached the end
+    ended: int | None  # steps before a bound was broken; None: it reached the end
 
     @property
     def survival_weighted_tracking(self) -> float:
@@ -52,19 +52,17 @@ class SideBySide:
 
     def __init__(
         self,
-        config: Config,
-        robot: Robot,
-        library: MotionLibrary,
+        setup: Setup,
         policies: Mapping[str, Policy | None],
         *,
         starts: int = 1,
     ):
-        config = evaluation_config(config)
+        setup = evaluation_setup(setup)
         self.names = tuple(policies)
-        self.library = library
-        self.env = tracking.make_environment(config, robot, len(policies) * starts, noisy=False)
+        self.library = setup.library
+        self.env = tracking.make_environment(setup, len(policies) * starts, noisy=False)
         self._starts = starts
-        self._assets = tracking.make_assets(config, robot, library)
+        self._assets = tracking.make_assets(setup)
         self._policies = tuple(policies.values())
         self._begin = jax.jit(self._begin_episodes)
         self._advance = jax.jit(self._advance_step)
@@ -107,9 +105,7 @@ def reference_qpos(robot: Robot, library: MotionLibrary, clip: int) -> np.ndarra
 
 
 def record(
-    config: Config,
-    robot: Robot,
-    library: MotionLibrary,
+    setup: Setup,
     policies: Mapping[str, Policy | None],
     clips: Sequence[str],
     *,
@@ -118,16 +114,15 @@ def record(
     """One episode of each clip from its first frame on, for every policy: those of an `Evaluator` with one a clip.
 
     Args:
-        config: whose physics, rewards and bounds hold; the evaluation's changes to it are made here.
-        robot: of the library.
-        library: the clips.
+        setup: whose robot, clips, physics, rewards and bounds hold; the evaluation's changes are made here.
         policies: name → networks; None for the zero action.
         clips: names of clips of the library.
         seed: of the reset noise.
     """
+    robot, library = setup.robot, setup.library
     every = np.arange(len(library.names))  # the noise of a clip's start does not depend on which clips are chosen
     chosen = [library.names.index(clip) for clip in clips]
-    stage = SideBySide(config, robot, library, policies, starts=len(every))
+    stage = SideBySide(setup, policies, starts=len(every))
     state = stage.begin(every, np.zeros_like(every), seed)
     horizon = np.asarray(state.horizon)
     poses, rewards, ended = [np.asarray(state.physics.qpos)], [], np.full(len(horizon), -1)
@@ -136,7 +131,7 @@ def record(
         poses.append(np.asarray(state.physics.qpos))
         rewards.append(np.asarray(result.reward.normalized_tracking))
         now = np.asarray(result.terminated) & (ended < 0) & (step < horizon)
-        ended[now] = max(step, 1)  # as the evaluation counts: the step that breaks a bound is not lived
+        ended[now] = max(step, 1)  # as the evaluation counts: the step that breaks a bound does not count
     qpos, tracking_reward = np.stack(poses, axis=1), np.stack(rewards, axis=1)
 
     def take(row: int) -> Take:

@@ -10,6 +10,7 @@ from typing import Any
 
 from forgetmimic_jax.ppo.state import TrainState
 from forgetmimic_jax.training import checkpoint, runner
+from forgetmimic_jax.tracking.setup import make_setup
 
 # The assistive wrench is on, so that unlearning has something to turn off.
 TINY = [
@@ -58,4 +59,4 @@ def finished(main: Callable[[Any], None], options: Any) -> Run:
 
 def load_state(path: Path) -> TrainState:
     """The whole state of a checkpoint."""
-    return checkpoint.load_state(path, runner.template(runner.make_setup(checkpoint.read_info(path).config)))
+    return checkpoint.load_state(path, runner.template(make_setup(checkpoint.read_info(path).config)))

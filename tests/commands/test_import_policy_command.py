@@ -11,9 +11,11 @@ from forgetmimic_jax import import_policy, unlearn
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.exchange import imported
 from forgetmimic_jax.exchange.onnx_actor import to_onnx
-from forgetmimic_jax.ppo.state import Policy, mean_action
+from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.settings.options import override
 from forgetmimic_jax.training import checkpoint, runner
+from forgetmimic_jax.tracking.setup import make_setup
+from forgetmimic_jax.training.start import start_state
 
 RSL_RL = Path(__file__).parents[1] / "exchange" / "rsl_rl" / "rsl_rl_5.5.1.pt"
 
@@ -33,7 +35,7 @@ def test_the_checkpoint_acts_as_rsl_rl_did(imported_run):
     policy = load_policy(imported_run.folder)
     original = np.load(RSL_RL.with_suffix(".npz"))
     inside = imported.within_limit(policy, original["observations"])
-    found = np.asarray(mean_action(policy, info.config, original["observations"]))
+    found = np.asarray(policy.mean_action(original["observations"]))
     assert inside.sum() >= 15
     np.testing.assert_allclose(found[inside], original["actions"][inside], rtol=1e-5, atol=1e-5)
 
@@ -48,8 +50,8 @@ def test_how_long_to_retrain_it_has_to_be_said(imported_run):
 def test_unlearning_starts_from_it(imported_run):
     config = unlearn.config_of_new_run(unlearn.Options(base=imported_run.folder, targets="turn"))
     small = [setting for setting in TINY if "layers" not in setting and "bin_seconds" not in setting]
-    setup = runner.make_setup(override(config, small))
-    start = runner.start_state(setup)
+    setup = make_setup(override(config, small))
+    start = start_state(setup)
     assert_same(start.policy, checkpoint.load_policy(imported_run.folder, runner.template(setup)))
     assert setup.config.unlearn.targets == ("turn",)
 
@@ -65,7 +67,7 @@ def test_it_tells_what_was_compared_and_assumed(imported_run):
 
 
 def load_policy(path: Path) -> Policy:
-    return checkpoint.load_policy(path, runner.template(runner.make_setup(checkpoint.read_info(path).config)))
+    return checkpoint.load_policy(path, runner.template(make_setup(checkpoint.read_info(path).config)))
 
 
 def test_what_was_exported_comes_back_as_it_went(base_run, library_folder, robot, tmp_path):

@@ -17,7 +17,10 @@ from forgetmimic_jax import train
 from forgetmimic_jax.motion.library import read_manifest, write_manifest
 from forgetmimic_jax.settings.config import load_config
 from forgetmimic_jax.settings.options import parse
-from forgetmimic_jax.training import checkpoint, runner
+from forgetmimic_jax.training import checkpoint
+from forgetmimic_jax.tracking.setup import make_setup
+from forgetmimic_jax.training.checkpoint import newest_checkpoint
+from forgetmimic_jax.training.start import start_state
 
 
 @pytest.fixture
@@ -72,7 +75,7 @@ def start(output: Path, *arguments: object) -> subprocess.Popen:
 def wait_for(process: subprocess.Popen, output: Path, iteration: int) -> None:
     """Until a checkpoint at or past `iteration` is there."""
     deadline = time.monotonic() + 120.0
-    while (newest := checkpoint.newest_checkpoint(output)) is None or int(newest.name) < iteration:
+    while (newest := newest_checkpoint(output)) is None or int(newest.name) < iteration:
         assert process.poll() is None, process.stderr.read()
         assert time.monotonic() < deadline
         time.sleep(0.05)
@@ -84,7 +87,7 @@ def test_a_run_survives_ctrl_c_and_kill_9_bit_for_bit(tmp_path, library_folder, 
     wait_for(process, output, 4)
     process.send_signal(signal.SIGINT)
     said = process.communicate(timeout=60)[1]
-    stopped = checkpoint.newest_checkpoint(output)
+    stopped = newest_checkpoint(output)
     assert process.returncode == 130
     assert said == f"stopped; saved {stopped}; go on with: make pretrain ROBOT=g1 RESUME=1 OUTPUT={output}\n"
 
@@ -92,7 +95,7 @@ def test_a_run_survives_ctrl_c_and_kill_9_bit_for_bit(tmp_path, library_folder, 
     wait_for(process, output, int(stopped.name) + 3)
     process.kill()
     process.communicate()
-    iterations = int(checkpoint.newest_checkpoint(output).name) + 2
+    iterations = int(newest_checkpoint(output).name) + 2
     again = finished(train.main, train.Options(output=output, iterations=iterations, resume=True))
     unbroken = finished(train.main, options(output=tmp_path / "unbroken", iterations=iterations))
     assert_same(load_state(again.checkpoint(iterations)), load_state(unbroken.checkpoint(iterations)))
@@ -109,7 +112,7 @@ def test_training_may_go_on_from_a_base_with_other_clips(base_run, tmp_path, lib
     write_manifest(library, manifest)
     config = checkpoint.read_info(base_run.checkpoint(4)).config
     config = dataclasses.replace(config, library=str(library), base=str(base_run.checkpoint(4)))
-    state = runner.start_state(runner.make_setup(config))
+    state = start_state(make_setup(config))
     assert_same(state.policy, load_state(base_run.checkpoint(4)).policy)
     assert all((np.asarray(leaf) == 0).all() for leaf in jax.tree.leaves(state.optimizer))
     assert state.failure_level.shape[0] == 2

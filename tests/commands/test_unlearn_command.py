@@ -15,7 +15,9 @@ from forgetmimic_jax.basics.files import read_rows
 from forgetmimic_jax.evaluation import evaluate as evaluation
 from forgetmimic_jax.motion.library import DATA_DIR, read_manifest
 from forgetmimic_jax.settings.config import load_config, validate
-from forgetmimic_jax.training import checkpoint, runner
+from forgetmimic_jax.training import checkpoint
+from forgetmimic_jax.tracking.setup import make_setup
+from forgetmimic_jax.training.start import start_state
 
 
 @pytest.fixture
@@ -346,9 +348,9 @@ def test_retraining_takes_as_many_steps_as_the_base_did(options):
 
 @pytest.mark.parametrize("given", [{"sampler": "adaptive"}, {"sampler": "frozen"}, {"wrench": True}])
 def test_what_goes_by_failure_levels_goes_on_with_the_base_s(options, base_run, given):
-    setup = runner.make_setup(unlearn.config_of_new_run(options(**given)))
+    setup = make_setup(unlearn.config_of_new_run(options(**given)))
     base = load_state(base_run.checkpoint(4)).failure_level
-    np.testing.assert_array_equal(runner.start_state(setup).failure_level, base)
+    np.testing.assert_array_equal(start_state(setup).failure_level, base)
     assert (np.asarray(base) != 1.0).any()
 
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from forgetmimic_jax.evaluation.rollout import CHUNK, Evaluator, episode_starts, evaluation_config, step_errors
 from forgetmimic_jax.physics import BodyState
-from forgetmimic_jax.ppo.state import Policy, init_policy
+from forgetmimic_jax.policy.policy import Policy, init_policy
 from forgetmimic_jax.tracking.env import StepResult
 from forgetmimic_jax.tracking.observation import actor_size
 from forgetmimic_jax.tracking.reference import lookup

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import pytest
 
 from forgetmimic_jax.policy.network import Normalizer
-from forgetmimic_jax.ppo.state import Policy, init_policy
+from forgetmimic_jax.policy.policy import Policy, init_policy
 from forgetmimic_jax.tracking.observation import actor_size
 
 

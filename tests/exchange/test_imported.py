@@ -5,7 +5,7 @@ import pytest
 
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.exchange.imported import ImportedActor, check_actor, notes, with_actor, within_limit
-from forgetmimic_jax.ppo.state import mean_action
+
 
 RANDOM = np.random.default_rng(0)
 
@@ -35,7 +35,7 @@ def test_the_policy_acts_as_the_imported_actor(actor, policy, tiny_config):
     made = with_actor(policy, actor, 0.4)
     expected = actor(observations)
     assert within_limit(made, observations).all()
-    found = np.asarray(mean_action(made, tiny_config, observations))
+    found = np.asarray(made.mean_action(observations))
     assert np.abs(found - expected).max() <= 1e-5 * np.abs(expected).max()
 
 

@@ -4,7 +4,7 @@ import pytest
 
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.exchange.onnx_actor import OnnxActor, to_onnx
-from forgetmimic_jax.ppo.state import mean_action
+
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +20,7 @@ def actor(model) -> OnnxActor:
 def test_its_actions_are_the_policys(actor, policy, tiny_config):
     observations = np.random.default_rng(0).normal(0.0, 3.0, (50, 132)).astype(np.float32)
     observations[:5] *= 100.0  # beyond what the normaliser lets through
-    expected = np.asarray(mean_action(policy, tiny_config, observations))
+    expected = np.asarray(policy.mean_action(observations))
     found = np.stack([actor(observation) for observation in observations])
     assert np.abs(expected).max() > 1.0
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)

@@ -14,10 +14,11 @@ from forgetmimic_jax.evaluation.rollout import act, begin_episodes
 from forgetmimic_jax.ppo.state import init_state
 from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.training import checkpoint, runner
+from forgetmimic_jax.tracking.setup import make_setup
 
 
 def setup_of(config, library_folder):
-    return runner.make_setup(dataclasses.replace(config, library=str(library_folder)))
+    return make_setup(dataclasses.replace(config, library=str(library_folder)))
 
 
 def saved(setup, path, seed):

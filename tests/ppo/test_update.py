@@ -12,7 +12,8 @@ from scipy import stats
 from forgetmimic_jax.physics import Engine
 from forgetmimic_jax.physics.native import NativeEngine
 from forgetmimic_jax.policy.network import Normalizer
-from forgetmimic_jax.ppo.state import TrainState, init_policy, init_state, make_actor, make_critic, make_optimizer
+from forgetmimic_jax.policy.policy import init_policy
+from forgetmimic_jax.ppo.state import TrainState, init_state, make_optimizer
 from forgetmimic_jax.ppo.update import Trajectory, collect, improve, learn_sampler, make_iteration
 from forgetmimic_jax.tracking.env import Assets, Environment, make_assets
 from forgetmimic_jax.unlearning.registry import unlearning_config

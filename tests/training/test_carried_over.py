@@ -12,7 +12,7 @@ import pytest
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.motion.library import DATA_DIR
 from forgetmimic_jax.policy.network import normalize, value
-from forgetmimic_jax.ppo.state import init_policy, make_critic, mean_action
+from forgetmimic_jax.policy.policy import init_policy
 from forgetmimic_jax.robot.model import load_robot
 from forgetmimic_jax.settings.config import preset
 from forgetmimic_jax.tracking.observation import actor_layout, actor_size
@@ -108,7 +108,7 @@ def test_the_head_is_not_heard(h2, robot, carried, scenes):
     observation, seen = scenes
     other = same_scene(robot, h2, observation, np.full((5, 2), 0.4))
     assert np.abs(other - seen).max() == pytest.approx(0.4)
-    actions = [np.asarray(mean_action(carried, TINY, jnp.asarray(each))) for each in (seen, other)]
+    actions = [np.asarray(carried.mean_action(jnp.asarray(each))) for each in (seen, other)]
     np.testing.assert_array_equal(*actions)
 
 

@@ -16,13 +16,15 @@ from trees import assert_same
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.ppo.state import TrainState
 from forgetmimic_jax.training import checkpoint, runner
+from forgetmimic_jax.tracking.setup import Setup, make_setup
+from forgetmimic_jax.training.checkpoint import newest_checkpoint
 
 STEPS = 96
 
 
 @pytest.fixture(scope="module")
-def setup(tiny_config, library_folder) -> runner.Setup:
-    return runner.make_setup(dataclasses.replace(tiny_config, library=str(library_folder)))
+def setup(tiny_config, library_folder) -> Setup:
+    return make_setup(dataclasses.replace(tiny_config, library=str(library_folder)))
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +45,7 @@ def state(template) -> TrainState:
     return dataclasses.replace(jax.tree.map(noise, template), iteration=np.int32(7))
 
 
-def save(path: Path, state: TrainState, setup: runner.Setup, **options) -> Path:
+def save(path: Path, state: TrainState, setup: Setup, **options) -> Path:
     checkpoint.save_checkpoint(
         path, state, setup.config, setup.robot, setup.library, setup.library_hash, environment_steps=STEPS, **options
     )
@@ -186,7 +188,7 @@ def test_an_unknown_setting_is_told_with_its_file(copy):
         checkpoint.read_info(copy)
 
 
-def matches(path: Path, setup: runner.Setup, **options) -> None:
+def matches(path: Path, setup: Setup, **options) -> None:
     info = checkpoint.read_info(path)
     checkpoint.check_matches(info, setup.robot, setup.library, setup.library_hash, setup.config, **options)
 
@@ -230,20 +232,20 @@ def test_other_environments_matter_to_a_resumed_run_only(saved, setup):
 def test_a_network_of_another_size_cannot_slip_through(copy, setup):
     # A config.yaml that was edited passes for the checkpoint's; the arrays do not.
     ppo = dataclasses.replace(setup.config.ppo, actor_layers=(8, 16))
-    other = runner.make_setup(dataclasses.replace(setup.config, ppo=ppo))
+    other = make_setup(dataclasses.replace(setup.config, ppo=ppo))
     told = r"copy/policy: policy.actor.params.\S+: found shape \[16\]; \[8\] is needed"
     with pytest.raises(InputError, match=told):
         checkpoint.load_policy(copy, runner.template(other))
     ppo = dataclasses.replace(setup.config.ppo, actor_layers=(16, 16, 16))
-    other = runner.make_setup(dataclasses.replace(setup.config, ppo=ppo))
+    other = make_setup(dataclasses.replace(setup.config, ppo=ppo))
     with pytest.raises(InputError, match=r"copy/policy: damaged or of another structure: ") as told:
         checkpoint.load_policy(copy, runner.template(other))
     assert "\n" not in str(told.value)
 
 
 def test_the_newest_is_the_highest_whole_one(tmp_path, saved):
-    assert checkpoint.newest_checkpoint(tmp_path) is None
+    assert newest_checkpoint(tmp_path) is None
     for name in ("00000009", "00000100", "00000200 (copy)", "best", ".00000300.tmp", "00000400"):
         shutil.copytree(saved, tmp_path / "checkpoints" / name)
     (tmp_path / "checkpoints" / "00000400" / "meta.json").unlink()
-    assert checkpoint.newest_checkpoint(tmp_path) == tmp_path / "checkpoints" / "00000100"
+    assert newest_checkpoint(tmp_path) == tmp_path / "checkpoints" / "00000100"

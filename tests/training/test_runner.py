@@ -21,16 +21,20 @@ from forgetmimic_jax.basics.files import read_rows
 from forgetmimic_jax.evaluation import watch
 from forgetmimic_jax.evaluation.metrics import Rollout
 from forgetmimic_jax.training import checkpoint, runner
+from forgetmimic_jax.tracking.setup import Setup, check_targets, make_setup
+from forgetmimic_jax.training.folder import default_folder, prepare_folder
+from forgetmimic_jax.training.run import run
+from forgetmimic_jax.training.start import base_checkpoint, base_folder
 
 CLIPS = 3
 
 
 @pytest.fixture(scope="module")
-def setup(tiny_config, library_folder) -> runner.Setup:
+def setup(tiny_config, library_folder) -> Setup:
     config = dataclasses.replace(
         tiny_config, library=str(library_folder), iterations=40, checkpoint_every=15, evaluate_every=0
     )
-    return runner.make_setup(config)
+    return make_setup(config)
 
 
 @pytest.fixture
@@ -58,7 +62,7 @@ def run(setup, tmp_path, monkeypatch):
 
     def run(*, resume: bool = False, **settings):
         config = dataclasses.replace(setup.config, **settings)
-        return runner.run(
+        return run(
             dataclasses.replace(setup, config=config), tmp_path / "run", description="count", resume=resume
         )
 
@@ -173,7 +177,7 @@ def test_the_best_policy_is_kept_too_also_over_a_resume(run, skill):
     best = run.folder / "best"
     assert checkpoint.read_info(best).iteration == 20
     assert not (best / "run").exists()
-    assert runner.prepare_folder(run.folder, resume=True).name == "00000030"
+    assert prepare_folder(run.folder, resume=True).name == "00000030"
 
     shutil.rmtree(run.folder / "checkpoints" / "00000030")  # as if killed before it was whole: 15 is the newest
     with (run.folder / "evaluations.jsonl").open("a") as file:
@@ -278,65 +282,65 @@ def test_a_run_that_cannot_save_at_all_leaves_no_folder(run):
 
 
 def test_a_folder_must_be_new(tmp_path):
-    runner.prepare_folder(tmp_path / "new", resume=False)
-    runner.prepare_folder(tmp_path, resume=False)  # there, but empty
+    prepare_folder(tmp_path / "new", resume=False)
+    prepare_folder(tmp_path, resume=False)  # there, but empty
     (tmp_path / "note").write_text("mine")
     with pytest.raises(InputError, match=r"exists already; choose another --output, or remove it$"):
-        runner.prepare_folder(tmp_path, resume=False)
+        prepare_folder(tmp_path, resume=False)
     (tmp_path / "checkpoints" / "00000001").mkdir(parents=True)
     (tmp_path / "checkpoints" / "00000001" / "meta.json").touch()
     with pytest.raises(InputError, match=r"exists already; choose another --output, or go on with --resume$"):
-        runner.prepare_folder(tmp_path, resume=False)
-    assert runner.prepare_folder(tmp_path, resume=True) == tmp_path / "checkpoints" / "00000001"
+        prepare_folder(tmp_path, resume=False)
+    assert prepare_folder(tmp_path, resume=True) == tmp_path / "checkpoints" / "00000001"
     for path in (tmp_path / "note", tmp_path / "note" / "below" / "it"):
         with pytest.raises(InputError, match=rf"^{path}: {tmp_path}/note is a file; choose another --output$"):
-            runner.prepare_folder(path, resume=False)
+            prepare_folder(path, resume=False)
 
 
 def test_a_folder_without_permission_is_told(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "access", lambda _path, _mode: False)  # which root would have everywhere
     with pytest.raises(InputError, match=rf"no permission to write in {tmp_path}; choose another --output"):
-        runner.prepare_folder(tmp_path / "run", resume=False)
+        prepare_folder(tmp_path / "run", resume=False)
 
 
 def test_nothing_to_resume_is_told(tmp_path):
     with pytest.raises(InputError, match=r"new: --resume finds no checkpoint there; leave it out to start$"):
-        runner.prepare_folder(tmp_path / "new", resume=True)
+        prepare_folder(tmp_path / "new", resume=True)
     assert not (tmp_path / "new").exists()
 
 
 def test_numbered_folders_follow_the_last(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert str(runner.default_folder("unlearn-g1", resume=False)) == "runs/unlearn-g1-001"
-    assert str(runner.default_folder("unlearn-g1", resume=True)) == "runs/unlearn-g1-001"
+    assert str(default_folder("unlearn-g1", resume=False)) == "runs/unlearn-g1-001"
+    assert str(default_folder("unlearn-g1", resume=True)) == "runs/unlearn-g1-001"
     for name in ("unlearn-g1-009", "unlearn-g1-010", "unlearn-g1-x", "unlearn-g1-5-old", "unlearn-h2-020"):
         (tmp_path / "runs" / name).mkdir(parents=True)
-    assert str(runner.default_folder("unlearn-g1", resume=False)) == "runs/unlearn-g1-011"
-    assert str(runner.default_folder("unlearn-g1", resume=True)) == "runs/unlearn-g1-010"
+    assert str(default_folder("unlearn-g1", resume=False)) == "runs/unlearn-g1-011"
+    assert str(default_folder("unlearn-g1", resume=True)) == "runs/unlearn-g1-010"
 
 
 def test_targets_are_clips_of_the_library_and_leave_one():
-    runner.check_targets((), ("punch", "kick"))
-    runner.check_targets(("kick",), ("punch", "kick"))
+    check_targets((), ("punch", "kick"))
+    check_targets(("kick",), ("punch", "kick"))
     with pytest.raises(InputError, match=r"no clip 'punhc' in the library; did you mean 'punch'\?"):
-        runner.check_targets(("punhc",), ("punch", "kick"))
+        check_targets(("punhc",), ("punch", "kick"))
     with pytest.raises(InputError, match=r"all 2 clips of the library; leave at least one to keep"):
-        runner.check_targets(("kick", "punch"), ("punch", "kick"))
+        check_targets(("kick", "punch"), ("punch", "kick"))
 
 
 def test_the_base_is_the_one_named_or_the_shipped_one(tmp_path, setup, monkeypatch):
     monkeypatch.setattr(runner, "DATA_DIR", tmp_path)
     with pytest.raises(InputError, match=r"g1/base: no policy is shipped for 'g1'; train one"):
-        runner.base_checkpoint(setup.config)
+        base_checkpoint(setup.config)
     (tmp_path / "g1" / "base").mkdir(parents=True)
-    assert runner.base_checkpoint(setup.config) == tmp_path / "g1" / "base"
-    assert runner.base_checkpoint(dataclasses.replace(setup.config, base="runs/mine")) == Path("runs/mine")
+    assert base_checkpoint(setup.config) == tmp_path / "g1" / "base"
+    assert base_checkpoint(dataclasses.replace(setup.config, base="runs/mine")) == Path("runs/mine")
     with pytest.raises(InputError, match=r"robot 'g11': .*did you mean 'g1'\?"):
-        runner.base_folder("g11")
+        base_folder("g11")
 
 
 def test_clips_are_resampled_to_the_control_rate(setup):
     physics = dataclasses.replace(setup.config.physics, substeps=8)  # 25 Hz
-    slower = runner.make_setup(dataclasses.replace(setup.config, physics=physics))
+    slower = make_setup(dataclasses.replace(setup.config, physics=physics))
     assert setup.library.length.tolist() == [80, 41, 60]
     assert slower.library.length.tolist() == [40, 21, 30]

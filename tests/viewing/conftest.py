@@ -2,7 +2,7 @@ import jax
 import pytest
 
 from forgetmimic_jax.basics.errors import InputError
-from forgetmimic_jax.ppo.state import Policy, init_policy
+from forgetmimic_jax.policy.policy import Policy, init_policy
 from forgetmimic_jax.tracking.observation import actor_size
 from forgetmimic_jax.viewing import offscreen
 from forgetmimic_jax.viewing.side_by_side import Episode, record

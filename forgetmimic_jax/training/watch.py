@@ -7,14 +7,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from forgetmimic_jax.basics.files import drop_rows_after, read_rows
 from forgetmimic_jax.evaluation.metrics import Rollout, episode_metrics
 from forgetmimic_jax.evaluation.plots import clips_over_time
 from forgetmimic_jax.evaluation.rollout import Evaluator
-from forgetmimic_jax.motion.library import MotionLibrary
-from forgetmimic_jax.ppo.state import Policy
-from forgetmimic_jax.robot.model import Robot
-from forgetmimic_jax.settings.config import Config
+from forgetmimic_jax.policy.policy import Policy
+from forgetmimic_jax.tracking.setup import Setup
 
 FILE = "evaluations.jsonl"
 SHOWN = ("success_rate", "survival_weighted_tracking", "tracking_reward")
@@ -32,25 +32,29 @@ def clip_means(rollout: Rollout, names: Sequence[str]) -> dict[str, dict[str, fl
 class Watch:
     """Evaluates a run's policy on the same few episodes each time: a row of evaluations.jsonl, and its PNG."""
 
-    def __init__(self, config: Config, robot: Robot, library: MotionLibrary, directory: Path, iteration: int):
-        self._evaluator = Evaluator(config, robot, library, episodes=config.evaluate_episodes, seed=config.seed)
-        self._names = library.names
+    def __init__(self, setup: Setup, directory: Path, iteration: int):
+        config, self._names = setup.config, setup.library.names
+        self._evaluator = Evaluator(setup, episodes=config.evaluate_episodes, seed=config.seed)
+        self._kept = np.isin(
+            self._evaluator.clip, [self._names.index(clip) for clip in config.unlearn.targets], invert=True
+        )
         self._path = directory / FILE
         rows = drop_rows_after(self._path, iteration)
-        self._best = max((row["survival_weighted_tracking"] for row in rows), default=-1.0)
+        self._best = max((row["kept_tracking"] for row in rows), default=-1.0)
 
     def __call__(self, policy: Policy, iteration: int, environment_steps: int) -> bool:
-        """Evaluate, add a row; whether this is the best mean survival-weighted tracking so far."""
+        """Evaluate, add a row; whether the clips to keep have their best mean survival-weighted tracking so far."""
         rollout = self._evaluator.rollout(policy)
         metrics = episode_metrics(rollout)
         row: dict[str, Any] = {"iteration": iteration, "environment_steps": environment_steps}
         row |= {name: float(metrics[name].mean()) for name in SHOWN}
+        row["kept_tracking"] = float(metrics["survival_weighted_tracking"][self._kept].mean())
         row["clips"] = clip_means(rollout, self._names)
         with self._path.open("a") as file:
             file.write(json.dumps(row) + "\n")
         clips_over_time(self._path, self._path.with_suffix(".png"))
-        better = row["survival_weighted_tracking"] > self._best
-        self._best = max(self._best, row["survival_weighted_tracking"])
+        better = row["kept_tracking"] > self._best
+        self._best = max(self._best, row["kept_tracking"])
         return better
 
     def table(self) -> Any:

@@ -1,0 +1,98 @@
+"""The steps of an iteration: a rollout of the current policy, or reference states in its place."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from forgetmimic_jax.policy.gaussian import log_prob
+from forgetmimic_jax.ppo.state import TrainState
+from forgetmimic_jax.ppo.transition import Outcome, Transition
+from forgetmimic_jax.tracking import env as tracking
+from forgetmimic_jax.tracking.env import Assets, Environment
+from forgetmimic_jax.tracking.rsi import bin_probabilities, episode_failure, sample_start
+from forgetmimic_jax.tracking.wrench import wrench_gain
+from forgetmimic_jax.unlearning.registry import method_of
+
+
+def collect(env: Environment, assets: Assets, state: TrainState) -> tuple[TrainState, Transition, Outcome]:
+    """`num_steps` control steps of every environment with the current policy.
+
+    With `branches`, every group of environments starts from the state of its first one.
+    """
+    config, policy, method = env.config, state.policy, method_of(env.config)
+    probabilities = bin_probabilities(config.sampling, assets.bins, state.failure_level, assets.is_target)
+    gains = wrench_gain(config.wrench, state.failure_level)
+
+    def observe(episodes: tracking.EnvState, key: Array) -> tuple[Array, Array]:
+        actor_obs, critic_obs = tracking.observe(env, assets, episodes, key if env.noisy else None)
+        return method.observation(actor_obs, assets.is_target[episodes.clip]), critic_obs
+
+    def one_step(carry, key: Array):
+        before, actor_obs, critic_obs = carry
+        action_key, step_key, reset_key, observe_key = jax.random.split(key, 4)
+        mean, log_std = policy.distribution(actor_obs)
+        action = mean + jnp.exp(log_std) * jax.random.normal(action_key, mean.shape)
+        after, result = tracking.step(env, assets, before, action, step_key)
+        fresh = tracking.reset_where(
+            env, assets, after, result.terminated | result.truncated, reset_key, probabilities, gains
+        )
+        last_critic_obs = tracking.observe(env, assets, after, None)[1]
+        reward_key = jax.random.fold_in(key, 4)  # none of the four above
+        reward = method.reward(config, result.reward, assets.is_target[before.clip], reward_key)
+        transition = Transition(
+            actor_observation=actor_obs,
+            critic_observation=critic_obs,
+            action=action,
+            log_prob=log_prob(action, mean, log_std),
+            mean=mean,
+            clip=before.clip,
+        )
+        outcome = Outcome(
+            reward=reward * env.control_step,
+            value=policy.value(critic_obs),
+            next_value=policy.value(last_critic_obs),
+            tracking=result.reward.tracking,
+            regularisation=result.reward.regularisation,
+            normalized_tracking=result.reward.normalized_tracking,
+            terminated=result.terminated,
+            truncated=result.truncated,
+            diverged=result.diverged,
+            start_bin=before.start_bin,
+            failure=episode_failure(config.sampling, after.tracking_sum, after.step, after.horizon),
+            steps=after.step,
+            wrench_gain=before.wrench_gain,
+            causes=result.causes,
+        )
+        return (fresh, *observe(fresh, observe_key)), (transition, outcome)
+
+    key, first_key, rollout_key = jax.random.split(state.key, 3)
+    keys = jax.random.split(rollout_key, config.ppo.num_steps)
+    leader = jnp.arange(env.num_envs) // config.ppo.branches * config.ppo.branches
+    start = jax.tree.map(lambda x: x[leader], state.env) if config.ppo.branches > 1 else state.env
+    (episodes, _, _), (transition, outcome) = jax.lax.scan(one_step, (start, *observe(start, first_key)), keys)
+    return dataclasses.replace(state, env=episodes, key=key), transition, outcome
+
+
+def draw_states(env: Environment, assets: Assets, state: TrainState) -> tuple[TrainState, Transition]:
+    """Starts of episodes in the place of a rollout: nothing moves, nothing is rewarded and no episode ends."""
+    config, policy = env.config, state.policy
+    probabilities = bin_probabilities(config.sampling, assets.bins, state.failure_level, assets.is_target)
+    no_gain = jnp.zeros((env.num_envs,), jnp.float32)
+
+    def one_batch(key: Array) -> Transition:
+        start_key, episode_key = jax.random.split(key)
+        clip, start_bin, frame = sample_start(start_key, probabilities, assets.bins, env.num_envs)
+        episodes = tracking.start_episodes(env, assets, episode_key, clip, start_bin, frame, no_gain)
+        actor_obs, critic_obs = tracking.observe(env, assets, episodes, None)
+        mean, log_std = policy.distribution(actor_obs)
+        return Transition(
+            actor_obs, critic_obs, action=mean, log_prob=log_prob(mean, mean, log_std), mean=mean, clip=clip
+        )
+
+    key, draw_key = jax.random.split(state.key)
+    transition = jax.lax.map(one_batch, jax.random.split(draw_key, config.ppo.num_steps))
+    return dataclasses.replace(state, key=key), transition

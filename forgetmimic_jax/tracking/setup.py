@@ -1,0 +1,72 @@
+"""Setup: a config with what it names loaded. The value that training, evaluation and the viewers are given whole."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+
+from forgetmimic_jax.basics.errors import InputError, nearest
+from forgetmimic_jax.motion.library import DATA_DIR, MotionLibrary, library_hash, load_library, read_manifest
+from forgetmimic_jax.policy.policy import Policy
+from forgetmimic_jax.robot.model import Robot, load_robot
+from forgetmimic_jax.settings.config import Config, validate
+
+COMPILATION_CACHE = DATA_DIR.parent / ".cache" / "jax"  # what XLA compiled is not compiled again at the next start
+
+
+@dataclass(frozen=True)
+class Setup:
+    """A config, its robot and its clips."""
+
+    config: Config
+    robot: Robot
+    library: MotionLibrary
+    library_hash: str
+    base: Policy | None = None  # the frozen policy that an unlearning run starts from and compares with
+
+
+def make_setup(config: Config) -> Setup:
+    """Load what a config names.
+
+    Raises:
+        InputError: a number that no run can work with, or an unknown robot, library or target.
+    """
+    validate(config)
+    if not jax.config.values["jax_compilation_cache_dir"]:
+        jax.config.update("jax_compilation_cache_dir", str(COMPILATION_CACHE))
+    robot = load_robot(
+        config.robot,
+        timestep=config.physics.timestep,
+        solver_iterations=config.physics.solver_iterations,
+        line_search_iterations=config.physics.line_search_iterations,
+        self_collision=config.physics.self_collision,
+    )
+    folder = library_folder(config)
+    library = load_library(robot, folder, fps=1.0 / config.physics.control_step)
+    check_targets(config.unlearn.targets, library.names)
+    return Setup(config, robot, library, library_hash(folder))
+
+
+def library_folder(config: Config) -> Path:
+    """The folder of a config's clips."""
+    return DATA_DIR / config.robot if config.library is None else Path(config.library)
+
+
+def default_targets(config: Config) -> tuple[str, ...]:
+    """The clips that the library itself proposes to forget."""
+    return tuple(read_manifest(library_folder(config)).get("default_targets", ()))
+
+
+def check_targets(targets: tuple[str, ...], names: tuple[str, ...]) -> None:
+    """Targets must be clips of the library, and not all of them.
+
+    Raises:
+        InputError: an unknown clip, or nothing left to keep.
+    """
+    for target in targets:
+        if target not in names:
+            raise InputError(f"targets: no clip '{target}' in the library; {nearest(target, names)}")
+    if targets and set(targets) == set(names):
+        raise InputError(f"targets: all {len(names)} clips of the library; leave at least one to keep")

@@ -1,0 +1,60 @@
+"""A run's folder: where it is, whether it can be written, and which checkpoints are in it.
+
+config.yaml         every setting
+metrics.jsonl       a row every few iterations
+events/             the same for TensorBoard
+checkpoints/NUMBER  the newest ones
+best/               with evaluations during training: the policy that did best on the clips to keep
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from forgetmimic_jax.basics.errors import InputError
+from forgetmimic_jax.training.checkpoint import newest_checkpoint
+
+BEST = "best"
+
+
+def folder_of(path: Path) -> Path | None:
+    """The run that a checkpoint belongs to, if any."""
+    if path.parent.name == "checkpoints":
+        return path.parent.parent
+    return path.parent if (path.parent / "checkpoints").is_dir() else None
+
+
+def default_folder(kind: str, *, resume: bool) -> Path:
+    """The next free folder runs/KIND-NUMBER, or with `resume` the last one."""
+    numbers = [int(path.name.rpartition("-")[2]) for path in Path("runs").glob(f"{kind}-[0-9]*")
+               if path.name.rpartition("-")[2].isdigit()]  # fmt: skip
+    last = max(numbers, default=0)
+    return Path("runs") / f"{kind}-{last if resume and last else last + 1:03d}"
+
+
+def prepare_folder(directory: Path, *, resume: bool) -> Path | None:
+    """The newest checkpoint to resume from; without `resume` the folder must be new or empty.
+
+    Raises:
+        InputError: the folder exists or cannot be written, or there is nothing to resume.
+    """
+    check_writable(directory)
+    if resume:
+        newest = newest_checkpoint(directory)
+        if newest is None:
+            raise InputError(f"{directory}: --resume finds no checkpoint there; leave it out to start")
+        return newest
+    if directory.exists() and any(directory.iterdir()):
+        other = "continue with --resume" if newest_checkpoint(directory) else "remove it"
+        raise InputError(f"{directory}: exists already; choose another --output, or {other}")
+    return None
+
+
+def check_writable(directory: Path) -> None:
+    """InputError unless `directory` can be written to or made."""
+    existing = next(path for path in (directory, *directory.parents) if path.exists())
+    if not existing.is_dir():
+        raise InputError(f"{directory}: {existing} is a file; choose another --output")
+    if not os.access(existing, os.W_OK):
+        raise InputError(f"{directory}: no permission to write in {existing}; choose another --output")
