@@ -11,7 +11,8 @@ from forgetmimic_jax.evaluation.tables import markdown_table, number
 from forgetmimic_jax.evaluation.variants import paired, variant_bars, variant_table
 from forgetmimic_jax.studies.study import Lab, Study, main
 from forgetmimic_jax.sweep import ablation
-from forgetmimic_jax.unlearn import PACE, TAUGHT
+from forgetmimic_jax.unlearning.distill import PACE as DISTILL_PACE
+from forgetmimic_jax.unlearning.method import SHORT
 
 CONTROL = "fine-tuned, all clips"
 PAPERS = ("random_reward", "negated_reward", "decremental", "trajdeleter")  # baselines that the paper has claims about
@@ -56,7 +57,10 @@ def tell(document: Mapping[str, Any]) -> str:
             "the cpu budget's pace they have the starts, and *plain PPO* takes those away.\n"
         )
     if "distill" in variants and asked["budget"] == "cpu":
-        steps = {name: of["minibatches"] * of["epochs"] for name, of in (("distill", TAUGHT), ("the others", PACE))}
+        steps = {
+            name: of["minibatches"] * of["epochs"]
+            for name, of in (("distill", DISTILL_PACE.ppo["cpu"]), ("the others", SHORT))
+        }
         told = ", ".join(f"{name} {count}" for name, count in steps.items())
         parts.append(f"Gradient steps an iteration: {told}.\n")
     if CONTROL in variants:

@@ -11,8 +11,8 @@ from forgetmimic_jax.basics.files import read_rows
 from forgetmimic_jax.evaluation.plots import curve, heat_map, new_figure
 from forgetmimic_jax.evaluation.tables import markdown_table, number
 from forgetmimic_jax.evaluation.variants import over_seeds, within
-from forgetmimic_jax.training.watch import SHOWN
 from forgetmimic_jax.studies.study import Lab, Study, main
+from forgetmimic_jax.training.watch import SHOWN
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

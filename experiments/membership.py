@@ -27,7 +27,7 @@ def measure(lab: Lab) -> dict[str, Any]:
     from forgetmimic_jax.motion.clip import read_clip
     from forgetmimic_jax.motion.mirror import mirrored
     from forgetmimic_jax.robot.model import load_robot
-    from forgetmimic_jax.training.runner import library_folder
+    from forgetmimic_jax.tracking.setup import library_folder
 
     runs = lab.run(
         {

@@ -21,7 +21,7 @@ from forgetmimic_jax.evaluation.relearning import at_first, lasted
 from forgetmimic_jax.evaluation.tables import markdown_table, number, percent
 from forgetmimic_jax.evaluation.variants import within
 from forgetmimic_jax.studies.study import ITERATIONS, Lab, Study, main, newest_policy
-from forgetmimic_jax.unlearn import PACE, TARGET_SHARE
+from forgetmimic_jax.unlearning.method import FINE_TUNING, SHORT
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -41,9 +41,9 @@ def measure(lab: Lab) -> dict[str, Any]:
     # A start's own settings would be its training's: all of them relearn at the same fixed pace and held by nothing. On
     # a laptop the targets have as many of the starts as in unlearning: whoever wants them back would do the same.
     on_laptop = lab.options.budget == "cpu"
-    pace = {**PACE, "schedule": "fixed", "anchor": 0.0} if on_laptop else {}
+    pace = {**SHORT, "schedule": "fixed", "anchor": 0.0} if on_laptop else {}
     alike = [f"ppo.{name}={json.dumps(value)}" for name, value in pace.items()]
-    alike += ["wrench.max_gain=0.0", f"sampling.target_share={TARGET_SHARE if on_laptop else 0.0}"]
+    alike += ["wrench.max_gain=0.0", f"sampling.target_share={FINE_TUNING.target_share['cpu'] if on_laptop else 0.0}"]
     watched = {"clips": "all", "set": [*lab.watched(EVALUATIONS), *alike]}
     relearn: dict[tuple[str, int], dict[str, Any]] = {
         (label, seed): {**watched, "method": "finetune", "base": policy, "seed": seed}

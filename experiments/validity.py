@@ -10,7 +10,7 @@ from forgetmimic_jax.evaluation.metrics import ZERO_ACTION
 from forgetmimic_jax.evaluation.tables import number
 from forgetmimic_jax.evaluation.variants import variant_table
 from forgetmimic_jax.studies.study import Lab, main, variants_study
-from forgetmimic_jax.unlearn import ITERATIONS
+from forgetmimic_jax.unlearning.method import FINE_TUNING
 
 ASKED_RATIO = 0.1  # of tracking, target over kept
 CONTROL = "fine-tuned, all clips"
@@ -25,7 +25,7 @@ def variants(lab: Lab) -> dict[str, dict[str, Any]]:
         "λ = 8": {"penalty": 8.0},
         "λ = 16": {"penalty": 16.0},
     }
-    whole = ITERATIONS[lab.options.budget]
+    whole = FINE_TUNING.iterations[lab.options.budget]
     if lab.options.iterations is None and whole > lab.iterations:
         control = {"method": "finetune", "clips": "all", "iterations": whole}
         result |= {at_length("λ = 16"): {"iterations": whole}, at_length(CONTROL): control}
@@ -34,7 +34,7 @@ def variants(lab: Lab) -> dict[str, dict[str, Any]]:
 
 def at_length(label: str) -> str:
     """A row as long as `make unlearn` on a laptop."""
-    return f"{label}, {ITERATIONS['cpu']} iterations"
+    return f"{label}, {FINE_TUNING.iterations['cpu']} iterations"
 
 
 def tell(document: Mapping[str, Any]) -> str:

@@ -70,7 +70,7 @@ def targets_study(
     """Other clips to forget, beside the paper's numbers where it has them."""
 
     def variants(lab: Lab) -> dict[str, dict[str, Any]]:
-        from forgetmimic_jax.training.runner import check_targets
+        from forgetmimic_jax.tracking.setup import check_targets
 
         asked = [comma_separated(group) for group in groups]
         if groups == GROUPS:  # as far as the robot's library has them

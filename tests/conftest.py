@@ -12,6 +12,7 @@ from forgetmimic_jax.motion.clip import Clip, write_clip
 from forgetmimic_jax.motion.library import MotionLibrary, build_library, file_hash, write_manifest
 from forgetmimic_jax.robot.model import Robot, load_robot
 from forgetmimic_jax.settings.config import Config, preset
+from forgetmimic_jax.tracking.setup import Setup
 
 # Compiling is most of what the tests wait for; this makes it three times as fast. JAX reads it when it first starts.
 os.environ["XLA_FLAGS"] += " --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
@@ -74,6 +75,12 @@ def tiny_config() -> Config:
             critic_layers=(16,),
         ),
     )
+
+
+@pytest.fixture(scope="session")
+def tiny_setup(robot, library, tiny_config) -> Setup:
+    """The tiny config on the two invented clips."""
+    return Setup(tiny_config, robot, library, library_hash="invented")
 
 
 @pytest.fixture(scope="session")

@@ -16,7 +16,7 @@ import onnxruntime
 from onnx import TensorProto, helper, numpy_helper
 
 from forgetmimic_jax.basics.errors import InputError
-from forgetmimic_jax.policy.network import OBSERVATION_LIMIT, VARIANCE_FLOOR
+from forgetmimic_jax.policy.normalizer import OBSERVATION_LIMIT, VARIANCE_FLOOR
 from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.robot.model import Robot
 from forgetmimic_jax.tracking.observation import actor_layout

@@ -14,7 +14,7 @@ from onnx.reference import ReferenceEvaluator
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.exchange.imported import ImportedActor
 from forgetmimic_jax.exchange.onnx_actor import INPUT, OUTPUT, metadata
-from forgetmimic_jax.policy.network import OBSERVATION_LIMIT
+from forgetmimic_jax.policy.normalizer import OBSERVATION_LIMIT
 from forgetmimic_jax.robot.model import Robot
 
 METADATA_TOLERANCE = 2e-3  # mjlab writes three decimals

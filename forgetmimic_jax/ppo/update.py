@@ -81,7 +81,7 @@ def make_batch(
         value_target=value_target,
         is_target=assets.is_target[transition.clip],
         weight=weight,
-        base=None if assets.base is None else predict(assets.base, transition),
+        base=None if assets.base is None else _at_every_step(predict(assets.base, transition)),
     )
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
 
@@ -89,7 +89,12 @@ def make_batch(
 def predict(policy: Policy, transition: Transition) -> Prediction:
     """What a policy and its critic say at the steps [...]; XLA leaves out what no loss uses."""
     mean, log_std = policy.distribution(transition.actor_observation)
-    return Prediction(mean, jnp.broadcast_to(log_std, mean.shape), policy.value(transition.critic_observation))
+    return Prediction(mean, log_std, policy.value(transition.critic_observation))
+
+
+def _at_every_step(prediction: Prediction) -> Prediction:
+    """With the standard deviation repeated for every step, as mini-batches are drawn from it."""
+    return dataclasses.replace(prediction, log_std=jnp.broadcast_to(prediction.log_std, prediction.mean.shape))
 
 
 def improve(run: Config, state: TrainState, batch: Batch) -> tuple[TrainState, Metrics]:

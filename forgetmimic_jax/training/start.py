@@ -81,12 +81,16 @@ def start_state(setup: Setup, env: Environment, assets: Assets) -> TrainState:
     return start(assets, key, policy, failure_level)
 
 
+def template(env: Environment, assets: Assets) -> TrainState:
+    """Shapes of a run's TrainState."""
+    return jax.eval_shape(lambda key: init_state(env, assets, key), jax.random.PRNGKey(0))
+
+
 def saved_state(setup: Setup, env: Environment, assets: Assets, path: Path) -> tuple[TrainState, int]:
     """The state of a checkpoint of this run, and the environment steps behind it."""
     info = checkpoint.read_info(path)
     checkpoint.check_matches(info, setup, resume=True)
-    template = jax.eval_shape(lambda key: init_state(env, assets, key), jax.random.PRNGKey(0))
-    state = checkpoint.load_state(info, template)
+    state = checkpoint.load_state(info, template(env, assets))
     step_size = setup.config.ppo.learning_rate
     if step_size != info.config.ppo.learning_rate:  # changed with --set; else the state's own holds
         state = dataclasses.replace(state, learning_rate=jnp.asarray(step_size, jnp.float32))

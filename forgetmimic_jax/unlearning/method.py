@@ -28,12 +28,12 @@ class Pace:
     """How long a method trains by default, and the PPO settings that it trains with.
 
     Args:
-        iterations: by preset; None: as many steps as the base was trained for.
+        iterations: by preset; of a preset without a number, as many steps as the base was trained for.
         ppo: settings of the `ppo` section by preset, in the place of the base's own.
         target_share: share of the uniform starts that are the targets', by preset.
     """
 
-    iterations: Mapping[str, int] | None
+    iterations: Mapping[str, int]
     ppo: Mapping[str, Mapping[str, Any]]
     target_share: Mapping[str, float] = field(default_factory=dict)
 

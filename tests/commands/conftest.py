@@ -1,4 +1,4 @@
-"""The whole path in miniature: a base of four iterations and a policy that was told to forget `turn` for two more."""
+"""The whole path in miniature: a base of four iterations and a policy that forgets `turn` for two more."""
 
 import dataclasses
 from collections.abc import Callable, Iterator
@@ -10,20 +10,20 @@ from miniature import TINY, Run, finished
 
 from forgetmimic_jax import train, unlearn
 from forgetmimic_jax.basics.errors import run_command
-from forgetmimic_jax.training import runner
+from forgetmimic_jax.training import run
 
 
 @pytest.fixture(scope="session", autouse=True)
 def compiled_once() -> Iterator[None]:
     """Runs of the same settings share one compiled iteration; it depends on none of the settings left out here."""
-    make, compiled = runner.make_iteration, {}
+    make, compiled = run.make_iteration, {}
 
     def shared(env):
         key = dataclasses.replace(env.config, iterations=1, checkpoint_every=1, base=None, seed=0)
         return compiled.setdefault(key, make(env))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(runner, "make_iteration", shared)
+        patch.setattr(run, "make_iteration", shared)
         yield
 
 

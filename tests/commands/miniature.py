@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from forgetmimic_jax.ppo.state import TrainState
-from forgetmimic_jax.training import checkpoint, runner
-from forgetmimic_jax.tracking.setup import make_setup
+from forgetmimic_jax.tracking.env import make_assets, make_environment
+from forgetmimic_jax.tracking.setup import Setup, make_setup
+from forgetmimic_jax.training import checkpoint
+from forgetmimic_jax.training.start import start_state, template
 
 # The assistive wrench is on, so that unlearning has something to turn off.
 TINY = [
@@ -57,6 +59,14 @@ def finished(main: Callable[[Any], None], options: Any) -> Run:
     return Run(options.output, printed.getvalue())
 
 
+def started(setup: Setup) -> TrainState:
+    """The state that a run of the setup starts with."""
+    return start_state(setup, make_environment(setup, setup.config.ppo.num_envs), make_assets(setup))
+
+
 def load_state(path: Path) -> TrainState:
     """The whole state of a checkpoint."""
-    return checkpoint.load_state(path, runner.template(make_setup(checkpoint.read_info(path).config)))
+    info = checkpoint.read_info(path)
+    setup = make_setup(info.config)
+    shapes = template(make_environment(setup, info.config.ppo.num_envs), make_assets(setup))
+    return checkpoint.load_state(info, shapes)

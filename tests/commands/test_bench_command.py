@@ -8,14 +8,14 @@ from forgetmimic_jax import bench
 from forgetmimic_jax.ppo import update
 from forgetmimic_jax.settings import config
 from forgetmimic_jax.settings.options import override
-from forgetmimic_jax.training import runner
+from forgetmimic_jax.training import run
 
 
 @pytest.fixture
 def tiny(monkeypatch):
     preset = config.preset
     monkeypatch.setattr(config, "preset", lambda name: override(preset(name), TINY))
-    monkeypatch.setattr(update, "make_iteration", runner.make_iteration)  # which other tests have compiled
+    monkeypatch.setattr(update, "make_iteration", run.make_iteration)  # which other tests have compiled
 
 
 def test_every_part_of_an_iteration_is_timed(tiny, tmp_path, library_folder):

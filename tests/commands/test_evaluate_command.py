@@ -94,8 +94,8 @@ def test_an_output_that_cannot_be_is_told_before_the_rollouts(refused, options, 
 
 def test_a_damaged_policy_is_told(refused, options, base_run, tmp_path):
     copy = Path(shutil.copytree(base_run.checkpoint(4), tmp_path / "copy"))
-    (copy / "policy" / "manifest.ocdbt").unlink()
-    told = f"{copy}/policy/manifest.ocdbt: missing; the checkpoint cannot be used"
+    (copy / "policy.safetensors").unlink()
+    told = f"{copy}/policy.safetensors: missing; the checkpoint cannot be used"
     assert refused(evaluate.main, options(checkpoint=copy)) == told
 
 

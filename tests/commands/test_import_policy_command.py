@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
-from miniature import TINY, finished
+from miniature import TINY, finished, started
 from trees import assert_same
 
 from forgetmimic_jax import import_policy, unlearn
@@ -13,9 +13,8 @@ from forgetmimic_jax.exchange import imported
 from forgetmimic_jax.exchange.onnx_actor import to_onnx
 from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.settings.options import override
-from forgetmimic_jax.training import checkpoint, runner
 from forgetmimic_jax.tracking.setup import make_setup
-from forgetmimic_jax.training.start import start_state
+from forgetmimic_jax.training import checkpoint
 
 RSL_RL = Path(__file__).parents[1] / "exchange" / "rsl_rl" / "rsl_rl_5.5.1.pt"
 
@@ -51,8 +50,8 @@ def test_unlearning_starts_from_it(imported_run):
     config = unlearn.config_of_new_run(unlearn.Options(base=imported_run.folder, targets="turn"))
     small = [setting for setting in TINY if "layers" not in setting and "bin_seconds" not in setting]
     setup = make_setup(override(config, small))
-    start = start_state(setup)
-    assert_same(start.policy, checkpoint.load_policy(imported_run.folder, runner.template(setup)))
+    start = started(setup)
+    assert_same(start.policy, checkpoint.load_policy(checkpoint.read_info(imported_run.folder)))
     assert setup.config.unlearn.targets == ("turn",)
 
 
@@ -67,7 +66,7 @@ def test_it_tells_what_was_compared_and_assumed(imported_run):
 
 
 def load_policy(path: Path) -> Policy:
-    return checkpoint.load_policy(path, runner.template(make_setup(checkpoint.read_info(path).config)))
+    return checkpoint.load_policy(checkpoint.read_info(path))
 
 
 def test_what_was_exported_comes_back_as_it_went(base_run, library_folder, robot, tmp_path):

@@ -232,7 +232,7 @@ def test_where_every_trial_fails_nothing_is_written(refused, base_run, tmp_path,
         ({"kind": "seeds", "targets": ","}, "--targets: no clip named; name at least one to forget, such as "),
         ({"kind": "seeds", "targets": "sway,turn,nod"}, "targets: all 3 clips of the library; leave at least one"),
         ({"kind": "seeds", "base": Path("nowhere")}, "nowhere: no such checkpoint folder"),
-        ({"kind": "seeds", "robot": "h2"}, "robot: the checkpoint's is 'g1', asked for 'h2'"),
+        ({"kind": "seeds", "robot": "h2"}, "robot: the checkpoint's is 'g1', this run's 'h2'"),
         ({"kind": "seeds", "draw": True}, "seeds.json: not measured yet; leave --draw out"),
     ],
 )

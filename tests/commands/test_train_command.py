@@ -10,17 +10,16 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from miniature import TINY, finished, load_state
+from miniature import TINY, finished, load_state, started
 from trees import assert_same
 
 from forgetmimic_jax import train
 from forgetmimic_jax.motion.library import read_manifest, write_manifest
 from forgetmimic_jax.settings.config import load_config
 from forgetmimic_jax.settings.options import parse
-from forgetmimic_jax.training import checkpoint
 from forgetmimic_jax.tracking.setup import make_setup
+from forgetmimic_jax.training import checkpoint
 from forgetmimic_jax.training.checkpoint import newest_checkpoint
-from forgetmimic_jax.training.start import start_state
 
 
 @pytest.fixture
@@ -89,7 +88,7 @@ def test_a_run_survives_ctrl_c_and_kill_9_bit_for_bit(tmp_path, library_folder, 
     said = process.communicate(timeout=60)[1]
     stopped = newest_checkpoint(output)
     assert process.returncode == 130
-    assert said == f"stopped; saved {stopped}; go on with: make pretrain ROBOT=g1 RESUME=1 OUTPUT={output}\n"
+    assert said == f"stopped; saved {stopped}; continue with: make pretrain ROBOT=g1 RESUME=1 OUTPUT={output}\n"
 
     process = start(output, "--resume", "--set", "checkpoint_every=1")
     wait_for(process, output, int(stopped.name) + 3)
@@ -112,7 +111,7 @@ def test_training_may_go_on_from_a_base_with_other_clips(base_run, tmp_path, lib
     write_manifest(library, manifest)
     config = checkpoint.read_info(base_run.checkpoint(4)).config
     config = dataclasses.replace(config, library=str(library), base=str(base_run.checkpoint(4)))
-    state = start_state(make_setup(config))
+    state = started(make_setup(config))
     assert_same(state.policy, load_state(base_run.checkpoint(4)).policy)
     assert all((np.asarray(leaf) == 0).all() for leaf in jax.tree.leaves(state.optimizer))
     assert state.failure_level.shape[0] == 2
@@ -204,7 +203,7 @@ def test_a_folder_that_cannot_be_the_run_s_is_told(refused, options, tmp_path, b
     told = f"{tmp_path}/file is a file; choose another --output"
     assert refused(train.main, options(output=tmp_path / "file")) == f"{tmp_path}/file: {told}"
     assert refused(train.main, options(output=tmp_path / "file" / "run")) == f"{tmp_path}/file/run: {told}"
-    told = f"{base_run.folder}: exists already; choose another --output, or go on with --resume"
+    told = f"{base_run.folder}: exists already; choose another --output, or continue with --resume"
     assert refused(train.main, options(output=base_run.folder)) == told
 
 
@@ -216,13 +215,13 @@ def test_flags_that_contradict_the_run_to_resume_are_told(refused, base_run):
     assert resume(seed=1) == f"--seed: found 1, {told}"
     assert resume(preset="paper").startswith("--preset: found paper, but the run to resume has cpu")
     assert resume(set=[["ppo.num_envs=16"]]) == (
-        f"{base_run.checkpoint(4)}: ppo.num_envs: the checkpoint's is 8, asked for 16"
+        f"{base_run.checkpoint(4)}: ppo.num_envs: the checkpoint's is 8, this run's 16"
     )
 
 
 def test_a_base_of_another_network_is_told(refused, options, base_run):
     told = refused(train.main, options(base=base_run.checkpoint(4), set=[[*TINY, "ppo.actor_layers=[8,8]"]]))
-    assert told == f"{base_run.checkpoint(4)}: ppo.actor_layers: the checkpoint's is [16], asked for [8, 8]"
+    assert told == f"{base_run.checkpoint(4)}: ppo.actor_layers: the checkpoint's is [16], this run's [8, 8]"
 
 
 def test_damaged_settings_of_the_run_to_resume_are_told(refused, base_run, tmp_path):

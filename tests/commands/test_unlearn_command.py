@@ -6,7 +6,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from miniature import TINY, finished, load_state
+from miniature import TINY, finished, load_state, started
 from trees import assert_same
 
 from forgetmimic_jax import train, unlearn
@@ -15,9 +15,8 @@ from forgetmimic_jax.basics.files import read_rows
 from forgetmimic_jax.evaluation import evaluate as evaluation
 from forgetmimic_jax.motion.library import DATA_DIR, read_manifest
 from forgetmimic_jax.settings.config import load_config, validate
-from forgetmimic_jax.training import checkpoint
 from forgetmimic_jax.tracking.setup import make_setup
-from forgetmimic_jax.training.start import start_state
+from forgetmimic_jax.training import checkpoint, start
 
 
 @pytest.fixture
@@ -137,7 +136,7 @@ def evaluated(monkeypatch) -> dict:
     """What would have been evaluated."""
     seen = {}
 
-    def evaluate(config, robot, library, library_hash, policies, **conditions):
+    def evaluate(_setup, policies, **conditions):
         seen.update(policies=policies, **conditions)
         raise KeyboardInterrupt
 
@@ -159,7 +158,7 @@ def test_a_stop_during_the_evaluation_says_how_to_go_on(unlearned_run, evaluated
     assert exit_.value.code == 130
     assert capfd.readouterr().err == (
         f"stopped; saved {unlearned_run.checkpoint(2)}; "
-        f"go on with: make unlearn ROBOT=g1 RESUME=1 OUTPUT={unlearned_run.folder}\n"
+        f"continue with: make unlearn ROBOT=g1 RESUME=1 OUTPUT={unlearned_run.folder}\n"
     )
 
 
@@ -209,7 +208,7 @@ def test_what_cannot_be_is_told_in_one_line(refused, options, given, told):
 
 
 def test_no_shipped_base_is_told(refused, options, tmp_path, monkeypatch):
-    monkeypatch.setattr(runner, "DATA_DIR", tmp_path)
+    monkeypatch.setattr(start, "DATA_DIR", tmp_path)
     told = f"{tmp_path}/g1/base: no policy is shipped for 'g1'; train one and name its checkpoint"
     assert refused(unlearn.main, options(base=None)) == told
 
@@ -224,13 +223,13 @@ def test_a_base_of_another_robot_is_told(refused, options, damaged):
     note = json.loads((damaged / "meta.json").read_text())
     (damaged / "meta.json").write_text(json.dumps(note | {"robot": "h2", "joints": note["joints"][:3]}))
     joints = len(note["joints"])
-    told = f"{damaged}: robot: the checkpoint's is 'h2' (3 joints), asked for 'g1' ({joints} joints)"
+    told = f"{damaged}: robot: the checkpoint's is 'h2' (3 joints), this run's 'g1' ({joints} joints)"
     assert refused(unlearn.main, options(base=damaged)) == told
 
 
 def test_a_base_of_another_network_is_told(refused, options, damaged):
     told = refused(unlearn.main, options(base=damaged, set=[["ppo.critic_layers=[8]"]]))
-    assert told == f"{damaged}: ppo.critic_layers: the checkpoint's is [16], asked for [8]"
+    assert told == f"{damaged}: ppo.critic_layers: the checkpoint's is [16], this run's [8]"
 
 
 def test_a_base_of_another_library_is_told(refused, options, damaged, tmp_path, library_folder):
@@ -244,11 +243,11 @@ def test_a_base_of_another_library_is_told(refused, options, damaged, tmp_path, 
 
 
 def test_a_damaged_base_is_told(refused, options, damaged):
-    for file in (damaged / "policy" / "d").iterdir():
-        file.write_bytes(file.read_bytes()[:100])
-        assert refused(unlearn.main, options(base=damaged)) == (
-            f"{file}: damaged: not what was saved; the checkpoint cannot be used"
-        )
+    file = damaged / "policy.safetensors"
+    file.write_bytes(file.read_bytes()[:100])
+    assert refused(unlearn.main, options(base=damaged)) == (
+        f"{file}: damaged: not what was saved; the checkpoint cannot be used"
+    )
     (damaged / "meta.json").write_text("{")
     assert refused(unlearn.main, options(base=damaged)).startswith(f"{damaged}/meta.json: damaged: ")
 
@@ -350,7 +349,7 @@ def test_retraining_takes_as_many_steps_as_the_base_did(options):
 def test_what_goes_by_failure_levels_goes_on_with_the_base_s(options, base_run, given):
     setup = make_setup(unlearn.config_of_new_run(options(**given)))
     base = load_state(base_run.checkpoint(4)).failure_level
-    np.testing.assert_array_equal(start_state(setup).failure_level, base)
+    np.testing.assert_array_equal(started(setup).failure_level, base)
     assert (np.asarray(base) != 1.0).any()
 
 

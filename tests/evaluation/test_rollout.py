@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from forgetmimic_jax.evaluation.rollout import CHUNK, Evaluator, episode_starts, evaluation_config, step_errors
+from forgetmimic_jax.evaluation.rollout import CHUNK, Evaluator, episode_starts, evaluation_setup, step_errors
 from forgetmimic_jax.physics import BodyState
 from forgetmimic_jax.policy.policy import Policy, init_policy
 from forgetmimic_jax.tracking.env import StepResult
@@ -18,8 +18,8 @@ EPISODES = 4  # a clip; the library has two
 
 
 @pytest.fixture(scope="module")
-def evaluator(robot, library, tiny_config) -> Evaluator:
-    return Evaluator(tiny_config, robot, library, episodes=EPISODES, seed=0)
+def evaluator(tiny_setup) -> Evaluator:
+    return Evaluator(tiny_setup, episodes=EPISODES, seed=0)
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def zero_action(evaluator):
 
 @pytest.fixture(scope="module")
 def policy(robot, tiny_config) -> Policy:
-    return init_policy(tiny_config, robot.num_joints, actor_size(robot.num_joints), 623, jax.random.PRNGKey(0))
+    return init_policy(tiny_config.ppo, robot.num_joints, actor_size(robot.num_joints), 623, jax.random.PRNGKey(0))
 
 
 def test_half_of_a_clips_episodes_start_at_its_beginning_and_half_are_spread_over_it():
@@ -62,10 +62,10 @@ def test_a_single_episode_starts_at_the_beginning():
     assert not episode_starts(np.array([300]), 1, seed=0)[1].any()
 
 
-def test_evaluation_has_no_randomisation_and_no_wrench_but_the_reset_noise_and_full_episodes(tiny_config):
+def test_evaluation_has_no_randomisation_and_no_wrench_but_the_reset_noise_and_full_episodes(tiny_config, tiny_setup):
     wrench = dataclasses.replace(tiny_config.wrench, max_gain=0.6)
     trained = dataclasses.replace(tiny_config, wrench=wrench, max_episode_steps=120)
-    config = evaluation_config(trained)
+    config = evaluation_setup(dataclasses.replace(tiny_setup, config=trained)).config
     assert config.wrench.max_gain == 0.0
     assert config.max_episode_steps == 500
     assert config.noise == dataclasses.replace(trained.noise, enabled=False)

@@ -10,8 +10,8 @@ from forgetmimic_jax.tracking import env as tracking
 
 
 @pytest.fixture(scope="module")
-def evaluator(robot, library, tiny_config) -> Evaluator:
-    return Evaluator(tiny_config, robot, library, episodes=2, seed=0)
+def evaluator(tiny_setup) -> Evaluator:
+    return Evaluator(tiny_setup, episodes=2, seed=0)
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,6 @@ import pytest
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.exchange.imported import ImportedActor, check_actor, notes, with_actor, within_limit
 
-
 RANDOM = np.random.default_rng(0)
 
 

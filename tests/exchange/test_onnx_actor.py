@@ -6,7 +6,6 @@ from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.exchange.onnx_actor import OnnxActor, to_onnx
 
 
-
 @pytest.fixture(scope="module")
 def model(policy, robot) -> onnx.ModelProto:
     return to_onnx(policy, robot, run_path="g1/0123456789abcdef", control_step=0.02)

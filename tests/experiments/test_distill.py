@@ -13,8 +13,8 @@ from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.evaluation.rollout import act, begin_episodes
 from forgetmimic_jax.ppo.state import init_state
 from forgetmimic_jax.tracking import env as tracking
-from forgetmimic_jax.training import checkpoint, runner
 from forgetmimic_jax.tracking.setup import make_setup
+from forgetmimic_jax.training import checkpoint, runner
 
 
 def setup_of(config, library_folder):

@@ -4,20 +4,10 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from forgetmimic_jax.policy.network import (
-    Actor,
-    Critic,
-    Normalizer,
-    bound_std,
-    distribution,
-    entropy,
-    init_normalizer,
-    kl_divergence,
-    log_prob,
-    normalize,
-    update_normalizer,
-    value,
-)
+from forgetmimic_jax.policy import normalizer as normalizer_module
+from forgetmimic_jax.policy.gaussian import entropy, kl_divergence, log_prob
+from forgetmimic_jax.policy.normalizer import Normalizer
+from forgetmimic_jax.policy.policy import Actor, Critic, bound_std
 
 KEY = jax.random.PRNGKey(0)
 MEAN, LOG_STD = np.array([0.3, -1.0, 2.0]), np.log([0.5, 1.0, 1.7])
@@ -38,17 +28,17 @@ def test_actor_and_critic_are_elu_perceptrons_with_a_linear_end():
     x = np.random.default_rng(0).standard_normal((5, 7))
     actor, critic = Actor((8, 6), 3, 1.0), Critic((4,))
     actor_parameters, critic_parameters = actor.init(KEY, jnp.asarray(x)), critic.init(KEY, jnp.asarray(x))
-    mean, _ = distribution(actor, actor_parameters, jnp.asarray(x))
+    mean, _ = actor.apply(actor_parameters, jnp.asarray(x))
     np.testing.assert_allclose(mean, perceptron(actor_parameters["params"]["MLP_0"], x), atol=1e-5)
     expected = perceptron(critic_parameters["params"]["MLP_0"], x)[:, 0]
-    np.testing.assert_allclose(value(critic, critic_parameters, jnp.asarray(x)), expected, atol=1e-5)
+    np.testing.assert_allclose(critic.apply(critic_parameters, jnp.asarray(x)), expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("initial_std", [1.0, 0.5])
 def test_the_standard_deviation_is_one_number_per_action_and_sees_no_observation(initial_std):
     actor = Actor((8,), 3, initial_std)
     parameters = actor.init(KEY, jnp.zeros((1, 7)))
-    log_std = distribution(actor, parameters, jax.random.normal(KEY, (5, 7)))[1]
+    log_std = actor.apply(parameters, jax.random.normal(KEY, (5, 7)))[1]
     np.testing.assert_allclose(np.exp(log_std), [initial_std] * 3, rtol=1e-6)
 
 
@@ -58,13 +48,13 @@ def test_a_standard_deviation_past_its_bound_comes_back_to_it_and_keeps_its_grad
     parameters["params"]["log_std"] = jnp.log(jnp.array([0.01, 0.5, 9.0]))
     bounded = bound_std(parameters)
     np.testing.assert_allclose(np.exp(bounded["params"]["log_std"]), [0.05, 0.5, 2.0], rtol=1e-6)
-    gradient = jax.grad(lambda p: distribution(actor, p, jnp.zeros((1, 7)))[1].sum())(bounded)
+    gradient = jax.grad(lambda p: actor.apply(p, jnp.zeros((1, 7)))[1].sum())(bounded)
     np.testing.assert_array_equal(gradient["params"]["log_std"], [1.0, 1.0, 1.0])
 
 
 def test_the_first_policy_is_almost_the_zero_action():
     actor = Actor((64, 64), 29, 1.0)
-    mean, _ = distribution(actor, actor.init(KEY, jnp.zeros((1, 132))), jax.random.normal(KEY, (50, 132)))
+    mean, _ = actor.apply(actor.init(KEY, jnp.zeros((1, 132))), jax.random.normal(KEY, (50, 132)))
     assert float(jnp.abs(mean).max()) < 0.3
 
 
@@ -99,9 +89,9 @@ def test_kl_of_a_policy_to_itself_is_zero():
 def test_normalizer_has_the_statistics_of_all_batches_together():
     rng = np.random.default_rng(1)
     batches = [rng.normal(3.0 * i, 1.0 + i, (4, 5 + i, 3)) for i in range(4)]
-    normalizer = init_normalizer(3)
+    normalizer = Normalizer.create(3)
     for batch in batches:
-        normalizer = update_normalizer(normalizer, jnp.asarray(batch, jnp.float32))
+        normalizer = normalizer.updated(jnp.asarray(batch, jnp.float32))
     together = np.concatenate([batch.reshape(-1, 3) for batch in batches])
     np.testing.assert_allclose(normalizer.mean, together.mean(0), rtol=1e-5)
     np.testing.assert_allclose(normalizer.variance, together.var(0), rtol=1e-4)
@@ -112,9 +102,9 @@ def test_a_feature_that_never_varied_starts_anew_when_it_first_does():
     rng = np.random.default_rng(4)
     before, after = rng.normal(2.0, 3.0, (1000, 2)), rng.normal(5.0, 0.1, (50, 2))
     before[:, 1] = 0.0
-    normalizer = init_normalizer(2)
+    normalizer = Normalizer.create(2)
     for batch in (before, before, after):
-        normalizer = update_normalizer(normalizer, jnp.asarray(batch, jnp.float32))
+        normalizer = normalizer.updated(jnp.asarray(batch, jnp.float32))
     together = np.concatenate([before, before, after])
     np.testing.assert_allclose(normalizer.mean, [together[:, 0].mean(), after[:, 1].mean()], rtol=1e-5)
     np.testing.assert_allclose(normalizer.variance, [together[:, 0].var(), after[:, 1].var()], rtol=1e-3)
@@ -122,22 +112,23 @@ def test_a_feature_that_never_varied_starts_anew_when_it_first_does():
 
 def test_normalized_observations_have_mean_zero_and_variance_one():
     observation = jnp.asarray(np.random.default_rng(2).normal(5.0, 3.0, (1000, 2)), jnp.float32)
-    scaled = normalize(update_normalizer(init_normalizer(2), observation), observation)
+    scaled = Normalizer.create(2).updated(observation)(observation)
     np.testing.assert_allclose(scaled.mean(0), 0.0, atol=1e-5)
     np.testing.assert_allclose(scaled.std(0), 1.0, atol=1e-5)
 
 
 def test_a_new_normalizer_changes_nothing():
-    np.testing.assert_allclose(normalize(init_normalizer(2), jnp.array([0.5, -3.0])), [0.5, -3.0], rtol=1e-5)
+    np.testing.assert_allclose(Normalizer.create(2)(jnp.array([0.5, -3.0])), [0.5, -3.0], rtol=1e-5)
 
 
 def test_normalized_observations_are_clipped_at_ten():
-    np.testing.assert_allclose(normalize(init_normalizer(2), jnp.array([1e6, -1e6])), [10.0, -10.0])
+    np.testing.assert_allclose(Normalizer.create(2)(jnp.array([1e6, -1e6])), [10.0, -10.0])
 
 
-def test_past_its_largest_count_the_normalizer_still_learns():
+def test_past_its_largest_count_the_normalizer_still_learns(monkeypatch):
+    monkeypatch.setattr(normalizer_module, "MAX_COUNT", 100.0)
     normalizer = Normalizer(jnp.zeros(1), jnp.ones(1), jnp.float32(100.0))
     for _ in range(200):
-        normalizer = update_normalizer(normalizer, jnp.full((10, 1), 2.0), max_count=100.0)
+        normalizer = normalizer.updated(jnp.full((10, 1), 2.0))
     assert float(normalizer.count) == 100.0
     assert float(normalizer.mean[0]) == pytest.approx(2.0, abs=1e-3)

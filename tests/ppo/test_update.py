@@ -1,7 +1,6 @@
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -11,11 +10,16 @@ from scipy import stats
 
 from forgetmimic_jax.physics import Engine
 from forgetmimic_jax.physics.native import NativeEngine
-from forgetmimic_jax.policy.network import Normalizer
+from forgetmimic_jax.policy.normalizer import Normalizer
 from forgetmimic_jax.policy.policy import init_policy
+from forgetmimic_jax.ppo.collect import collect
+from forgetmimic_jax.ppo.log import rollout_metrics
 from forgetmimic_jax.ppo.state import TrainState, init_state, make_optimizer
-from forgetmimic_jax.ppo.update import Trajectory, collect, improve, learn_sampler, make_iteration
+from forgetmimic_jax.ppo.transition import Outcome, Transition
+from forgetmimic_jax.ppo.update import improve, learn_normalizers, learn_sampler, make_batch, make_iteration
+from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking.env import Assets, Environment, make_assets
+from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.unlearning.registry import unlearning_config
 
 ENVS, STEPS, CONTROL_STEP = 8, 4, 0.02
@@ -56,7 +60,7 @@ def run(robot, library, tiny_config) -> Run:
     )
     engine = Faulty(NativeEngine(robot, 1, ENVS))  # with the wrench, a physics step at a time
     env = Environment(config, robot, engine, ENVS, noisy=True)
-    assets = make_assets(config, robot, library)
+    assets = make_assets(Setup(config, robot, library, ""))
     begin = jax.jit(lambda assets, key: init_state(env, assets, key))
     return Run(
         env=env,
@@ -68,8 +72,18 @@ def run(robot, library, tiny_config) -> Run:
 
 
 @pytest.fixture(scope="module")
-def trajectory(run) -> Trajectory:
-    return jax.device_get(run.collect(run.assets, run.start())[1])
+def rollout(run) -> tuple[Transition, Outcome]:
+    return jax.device_get(run.collect(run.assets, run.start())[1:])
+
+
+@pytest.fixture(scope="module")
+def transition(rollout) -> Transition:
+    return rollout[0]
+
+
+@pytest.fixture(scope="module")
+def outcome(rollout) -> Outcome:
+    return rollout[1]
 
 
 def finite(tree) -> bool:
@@ -130,11 +144,11 @@ def test_a_diverged_environment_is_counted_and_reaches_neither_metrics_nor_netwo
     assert (state.env.parameters.foot_friction > 0).all()
 
 
-def test_collected_actions_have_the_density_of_the_policy(run, trajectory):
+def test_collected_actions_have_the_density_of_the_policy(run, transition):
     std = run.env.config.ppo.initial_std
-    expected = stats.norm(trajectory.mean, std).logpdf(trajectory.action).sum(-1)
-    np.testing.assert_allclose(trajectory.log_prob, expected, rtol=1e-4)
-    assert (trajectory.action - trajectory.mean).std() == pytest.approx(std, rel=0.1)
+    expected = stats.norm(transition.mean, std).logpdf(transition.action).sum(-1)
+    np.testing.assert_allclose(transition.log_prob, expected, rtol=1e-4)
+    assert (transition.action - transition.mean).std() == pytest.approx(std, rel=0.1)
 
 
 def test_branches_set_out_from_their_leaders_state_and_part(run):
@@ -147,9 +161,9 @@ def test_branches_set_out_from_their_leaders_state_and_part(run):
     assert len(np.unique(seen[1], axis=0)) == ENVS
 
 
-def test_the_value_of_the_state_reached_is_the_next_steps_value_until_the_episode_ends(trajectory):
-    goes_on = ~(trajectory.terminated | trajectory.truncated)[:-1]
-    np.testing.assert_allclose(trajectory.next_value[:-1][goes_on], trajectory.value[1:][goes_on], atol=1e-4)
+def test_the_value_of_the_state_reached_is_the_next_steps_value_until_the_episode_ends(outcome):
+    goes_on = ~(outcome.terminated | outcome.truncated)[:-1]
+    np.testing.assert_allclose(outcome.next_value[:-1][goes_on], outcome.value[1:][goes_on], atol=1e-4)
 
 
 def test_the_value_after_an_episodes_last_step_is_of_the_state_it_ended_in(run, library):
@@ -165,31 +179,55 @@ def test_the_value_after_an_episodes_last_step_is_of_the_state_it_ended_in(run, 
         policy=dataclasses.replace(state.policy, critic=critic),
         env=dataclasses.replace(state.env, horizon=horizon),
     )
-    trajectory = jax.device_get(run.collect(run.assets, state)[1])
-    assert trajectory.truncated[0, ::2].all()
-    one_frame = 1.0 / np.asarray(library.length)[trajectory.clip]
-    np.testing.assert_allclose(trajectory.next_value - trajectory.value, one_frame, atol=1e-5)
+    transition, outcome = jax.device_get(run.collect(run.assets, state)[1:])
+    assert outcome.truncated[0, ::2].all()
+    one_frame = 1.0 / np.asarray(library.length)[transition.clip]
+    np.testing.assert_allclose(outcome.next_value - outcome.value, one_frame, atol=1e-5)
 
 
-def test_the_training_reward_is_per_control_step_and_turned_round_on_target_steps(trajectory):
-    on_target = trajectory.clip == 1
+def test_the_training_reward_is_per_control_step_and_turned_round_on_target_steps(transition, outcome):
+    on_target = transition.clip == 1
     assert 0 < on_target.sum() < on_target.size
-    per_second = trajectory.tracking + trajectory.regularisation - 16.0 * trajectory.normalized_tracking * on_target
-    np.testing.assert_allclose(trajectory.reward, CONTROL_STEP * per_second, rtol=1e-5, atol=1e-6)
+    per_second = outcome.tracking + outcome.regularisation - 16.0 * outcome.normalized_tracking * on_target
+    np.testing.assert_allclose(outcome.reward, CONTROL_STEP * per_second, rtol=1e-5, atol=1e-6)
 
 
-def test_the_gain_of_an_untrained_bin_is_the_largest(trajectory):
-    np.testing.assert_allclose(trajectory.wrench_gain, 0.6)
+def test_the_gain_of_an_untrained_bin_is_the_largest(outcome):
+    np.testing.assert_allclose(outcome.wrench_gain, 0.6)
+
+
+@dataclass
+class Problem:
+    """One gradient step on an invented batch."""
+
+    config: Config
+    assets: Assets
+    state: TrainState
+    transition: Transition
+    value: jax.Array
+    advantage: jax.Array
+    value_target: jax.Array
+
+    def improved(self, **ppo):
+        """`improve`, compiled, with other PPO settings."""
+        config = dataclasses.replace(self.config, ppo=dataclasses.replace(self.config.ppo, **ppo))
+
+        def function(state, transition, value, advantage, value_target):
+            batch = make_batch(config, self.assets, transition, value, advantage, value_target)
+            state, metrics = improve(config, state, batch)
+            return learn_normalizers(state, transition), metrics
+
+        return jax.jit(function)(self.state, self.transition, self.value, self.advantage, self.value_target)
 
 
 @pytest.fixture(scope="module")
-def problem(robot, tiny_config, run):
-    """One gradient step on an invented batch: config with one epoch and one mini-batch, state, batch."""
+def problem(robot, tiny_config, run) -> Problem:
+    """One epoch and one mini-batch."""
     ppo = dataclasses.replace(tiny_config.ppo, schedule="fixed", entropy_cost=0.005, initial_std=0.5)
     ppo = dataclasses.replace(ppo, epochs=1, minibatches=1)
     config = dataclasses.replace(tiny_config, ppo=ppo)
     rng = np.random.default_rng(0)
-    policy = init_policy(config, robot.num_joints, 5, 7, jax.random.PRNGKey(1))
+    policy = init_policy(ppo, robot.num_joints, 5, 7, jax.random.PRNGKey(1))
     policy = dataclasses.replace(
         policy,
         actor_normalizer=Normalizer(jnp.full(5, 2.0), jnp.full(5, 4.0), jnp.float32(100.0)),
@@ -197,55 +235,47 @@ def problem(robot, tiny_config, run):
     )
     observation = jnp.asarray(rng.normal(2.0, 2.0, (STEPS, ENVS, 5)), jnp.float32)
     privileged = jnp.asarray(rng.normal(-1.0, 0.5, (STEPS, ENVS, 7)), jnp.float32)
-    mean = jax.jit(make_actor(config, 29).apply)(policy.actor, (observation - 2.0) / 2.0)[0]
+    mean = jax.jit(policy.actor_module.apply)(policy.actor, (observation - 2.0) / 2.0)[0]
     action = mean + 0.5 * jnp.asarray(rng.standard_normal((STEPS, ENVS, 29)), jnp.float32)
-    value = jax.jit(make_critic(config).apply)(policy.critic, (privileged + 1.0) / 0.5)
-    batch = dict(
+    transition = Transition(
         actor_observation=observation,
         critic_observation=privileged,
         action=action,
         log_prob=jnp.asarray(stats.norm(mean, 0.5).logpdf(action).sum(-1), jnp.float32),
         mean=mean,
-        value=value,
         clip=jnp.zeros((STEPS, ENVS), jnp.int32),
     )
-    optimizer = make_optimizer(config).init((policy.actor, policy.critic))
-    state = dataclasses.replace(run.start(), policy=policy, optimizer=optimizer, learning_rate=jnp.float32(1e-3))
-    advantage, target = (jnp.asarray(rng.standard_normal((STEPS, ENVS)), jnp.float32) for _ in range(2))
-    return SimpleNamespace(config=config, robot=robot, assets=run.assets), state, batch, advantage, target
-
-
-def improved(env, state, batch: dict, advantage, target):
-    """`improve`, compiled."""
-
-    def function(state, batch, advantage, target):
-        return improve(env, env.assets, state, SimpleNamespace(**batch), advantage, target)
-
-    return jax.jit(function)(state, batch, advantage, target)
+    state = dataclasses.replace(
+        run.start(),
+        policy=policy,
+        optimizer=make_optimizer(ppo).init(policy.parameters),
+        learning_rate=jnp.float32(1e-3),
+    )
+    value = jax.jit(policy.critic_module.apply)(policy.critic, (privileged + 1.0) / 0.5)
+    advantage, value_target = (jnp.asarray(rng.standard_normal((STEPS, ENVS)), jnp.float32) for _ in range(2))
+    return Problem(config, run.assets, state, transition, value, advantage, value_target)
 
 
 def test_the_first_gradient_step_is_adams_on_rsl_rls_loss(problem):
-    env, state, batch, advantage, target = problem
+    policy, transition, advantage = problem.state.policy, problem.transition, problem.advantage
     scaled = (advantage - advantage.mean()) / advantage.std()
-    old_log_prob, old_value = batch["log_prob"], batch["value"]
 
     def loss(parameters):
-        mean, log_std = make_actor(env.config, 29).apply(parameters[0], (batch["actor_observation"] - 2.0) / 2.0)
-        value = make_critic(env.config).apply(parameters[1], (batch["critic_observation"] + 1.0) / 0.5)
-        log_prob = jax.scipy.stats.norm.logpdf(batch["action"], mean, jnp.exp(log_std)).sum(-1)
-        ratio = jnp.exp(log_prob - old_log_prob)
+        mean, log_std = policy.actor_module.apply(parameters[0], (transition.actor_observation - 2.0) / 2.0)
+        value = policy.critic_module.apply(parameters[1], (transition.critic_observation + 1.0) / 0.5)
+        log_prob = jax.scipy.stats.norm.logpdf(transition.action, mean, jnp.exp(log_std)).sum(-1)
+        ratio = jnp.exp(log_prob - transition.log_prob)
         surrogate = jnp.maximum(-scaled * ratio, -scaled * jnp.clip(ratio, 0.8, 1.2)).mean()
-        clipped = old_value + jnp.clip(value - old_value, -0.2, 0.2)
-        value_loss = jnp.maximum((value - target) ** 2, (clipped - target) ** 2).mean()
+        clipped = problem.value + jnp.clip(value - problem.value, -0.2, 0.2)
+        errors = ((value - problem.value_target) ** 2, (clipped - problem.value_target) ** 2)
         entropy = (0.5 * jnp.log(2 * jnp.pi * jnp.e) + log_std).sum()
-        return surrogate + 1.0 * value_loss - 0.005 * entropy
+        return surrogate + 1.0 * jnp.maximum(*errors).mean() - 0.005 * entropy
 
-    gradient = jax.jit(jax.grad(loss))((state.policy.actor, state.policy.critic))
+    gradient = jax.jit(jax.grad(loss))(policy.parameters)
     norm = float(np.sqrt(sum(float((leaf**2).sum()) for leaf in jax.tree.leaves(gradient))))
-    after, metrics = improved(env, state, batch, advantage, target)
+    after, metrics = problem.improved()
     assert float(metrics["gradient_norm"]) == pytest.approx(norm, rel=1e-3)
-    changes = jax.tree.map(lambda new, old: new - old, (after.policy.actor, after.policy.critic),
-                           (state.policy.actor, state.policy.critic))  # fmt: skip
+    changes = jax.tree.map(lambda new, old: new - old, after.policy.parameters, policy.parameters)
     for change, slope in zip(jax.tree.leaves(changes), jax.tree.leaves(gradient), strict=True):
         slope = np.asarray(slope) / max(norm, 1.0)
         clear = np.abs(slope) > 1e-5  # Adam's first step is lr · g / (|g| + 1e-8)
@@ -254,67 +284,60 @@ def test_the_first_gradient_step_is_adams_on_rsl_rls_loss(problem):
 
 def test_clips_can_weigh_the_same(problem):
     """The value loss of the first step: the mean of the clips' means, where one has a single step."""
-    env, state, batch, advantage, target = problem
     clip = np.zeros((STEPS, ENVS), np.int32)
     clip[0, 0] = 1
-    error = np.asarray((batch["value"] - target) ** 2)
-    losses = {}
-    for equal in (False, True):
-        ppo = dataclasses.replace(env.config.ppo, equal_clips=equal, clip_value=False)
-        run = SimpleNamespace(config=dataclasses.replace(env.config, ppo=ppo), robot=env.robot, assets=env.assets)
-        losses[equal] = float(
-            improved(run, state, batch | {"clip": jnp.asarray(clip)}, advantage, target)[1]["value_loss"]
-        )
+    error = np.asarray((problem.value - problem.value_target) ** 2)
+    two_clips = dataclasses.replace(problem, transition=dataclasses.replace(problem.transition, clip=jnp.asarray(clip)))
+    losses = {
+        equal: float(two_clips.improved(equal_clips=equal, clip_value=False)[1]["value_loss"])
+        for equal in (False, True)
+    }
     assert losses[False] == pytest.approx(error.mean(), rel=1e-4)
     assert losses[True] == pytest.approx((error[clip == 0].mean() + error[0, 0]) / 2, rel=1e-4)
 
 
 def test_the_normalisers_learn_the_batch_after_the_update(problem):
-    env, state, batch, advantage, target = problem
-    after, _ = improved(env, state, batch, advantage, target)
+    after, _ = problem.improved()
     count = STEPS * ENVS
-    expected = (100 * 2.0 + np.asarray(batch["actor_observation"]).sum((0, 1))) / (100 + count)
+    expected = (100 * 2.0 + np.asarray(problem.transition.actor_observation).sum((0, 1))) / (100 + count)
     np.testing.assert_allclose(after.policy.actor_normalizer.mean, expected, rtol=1e-5)
     assert float(after.policy.critic_normalizer.count) == 100 + count
 
 
+def at(problem: Problem, **state) -> Problem:
+    """The problem at another state of the run."""
+    return dataclasses.replace(problem, state=dataclasses.replace(problem.state, **state))
+
+
 def test_the_adaptive_schedule_slows_down_when_the_policy_moves_too_far(problem):
-    env, state, batch, advantage, target = problem
-    ppo = dataclasses.replace(env.config.ppo, schedule="adaptive", epochs=4, learning_rate=1e-2)
-    far = SimpleNamespace(config=dataclasses.replace(env.config, ppo=ppo), robot=env.robot, assets=env.assets)
-    after, metrics = improved(
-        far, dataclasses.replace(state, learning_rate=jnp.float32(1e-2)), batch, advantage, target
-    )
+    far = at(problem, learning_rate=jnp.float32(1e-2))
+    after, metrics = far.improved(schedule="adaptive", epochs=4, learning_rate=1e-2)
     assert float(metrics["kl_final"]) > 0.02
     assert float(after.learning_rate) < 1e-2
 
 
 def test_once_an_iteration_the_schedule_follows_the_last_epochs_kl(problem):
-    env, state, batch, advantage, target = problem
     for learning_rate, factor in ((1e-2, 1 / 1.5), (1e-5, 1.5)):
-        ppo = dataclasses.replace(env.config.ppo, schedule="adaptive_iteration", epochs=4, target_kl=0.01)
-        slow = SimpleNamespace(config=dataclasses.replace(env.config, ppo=ppo), robot=env.robot, assets=env.assets)
-        start = dataclasses.replace(state, learning_rate=jnp.float32(learning_rate))
-        after, metrics = improved(slow, start, batch, advantage, target)
+        start = at(problem, learning_rate=jnp.float32(learning_rate))
+        after, metrics = start.improved(schedule="adaptive_iteration", epochs=4, target_kl=0.01)
         assert (float(metrics["kl_final"]) > 0.02) == (factor < 1)
         assert float(after.learning_rate) == pytest.approx(learning_rate * factor)
 
 
 def test_the_trapezoid_is_where_the_run_is(problem):
-    env, state, batch, advantage, target = problem
-    ppo = dataclasses.replace(env.config.ppo, schedule="trapezoid", learning_rate=1e-3, min_learning_rate=0.0)
-    config = dataclasses.replace(env.config, iterations=10, ppo=ppo)
-    run = SimpleNamespace(config=config, robot=env.robot, assets=env.assets)
+    run = dataclasses.replace(problem, config=dataclasses.replace(problem.config, iterations=10))
     for iteration, learning_rate in ((0, 0.0), (1, 1e-3), (5, 1e-3), (7, 6e-4), (9, 2e-4)):
-        after, _ = improved(run, dataclasses.replace(state, iteration=jnp.int32(iteration)), batch, advantage, target)
+        here = at(run, iteration=jnp.int32(iteration))
+        after, _ = here.improved(schedule="trapezoid", learning_rate=1e-3, min_learning_rate=0.0)
         assert float(after.learning_rate) == pytest.approx(learning_rate)
 
 
 def test_ended_episodes_and_steps_are_counted_clip_by_clip(run):
     flat = np.zeros((2, 3))
     done = np.array([[0, 1, 0], [0, 0, 1]], bool)
-    trajectory = Trajectory(
-        **dict.fromkeys(("actor_observation", "critic_observation", "action", "log_prob", "mean", "next_value"), flat),
+    clip = jnp.asarray([[0, 1, 1], [0, 0, 1]])
+    outcome = Outcome(
+        next_value=flat,
         value=np.full((2, 3), 4.0),
         reward=np.full((2, 3), 0.5),
         tracking=np.array([[8.0, 4.0, 4.0], [8.0, 2.0, 6.0]]),
@@ -323,17 +346,17 @@ def test_ended_episodes_and_steps_are_counted_clip_by_clip(run):
         terminated=np.array([[0, 1, 0], [0, 0, 0]], bool),
         truncated=np.array([[0, 0, 0], [0, 0, 1]], bool),
         diverged=np.zeros((2, 3), bool),
-        clip=np.array([[0, 1, 1], [0, 0, 1]]),
         start_bin=np.zeros((2, 3), int),
         failure=np.where(done, [[0, 0.9, 0], [0, 0, 0.2]], 0.5),
         steps=np.array([[10, 7, 20], [11, 1, 21]]),
         wrench_gain=flat,
         causes={"anchor_height": np.array([[0, 1, 0], [0, 0, 0]], bool)},
     )
-    trajectory = jax.tree.map(jnp.asarray, trajectory)
+    outcome = jax.tree.map(jnp.asarray, outcome)
     state = run.start()
     level = np.asarray(state.failure_level)
-    state, metrics = jax.device_get(learn_sampler(run.env, run.assets, state, trajectory, {}))
+    state = learn_sampler(run.env.config, state, clip, outcome)
+    metrics = jax.device_get(rollout_metrics(run.env.config, run.assets, state, clip, outcome))
     np.testing.assert_array_equal(metrics["clip/steps"], [3, 3])
     np.testing.assert_array_equal(metrics["clip/episodes"], [0, 2])
     np.testing.assert_array_equal(metrics["clip/episode_length_sum"], [0, 28])
@@ -357,26 +380,27 @@ def with_method(run: Run, name: str) -> Environment:
     return dataclasses.replace(run.env, config=dataclasses.replace(run.env.config, unlearn=unlearn))
 
 
-def test_what_a_method_shows_the_actor_is_what_it_acts_on(run, trajectory):
+def test_what_a_method_shows_the_actor_is_what_it_acts_on(run, transition):
     env = with_method(run, "poisoning")
     found = jax.device_get(jax.jit(lambda assets, state: collect(env, assets, state))(run.assets, run.start())[1])
-    first, on_target = slice(0, 1), trajectory.clip[0] == 1
-    true, shown = trajectory.actor_observation[first], found.actor_observation[first]
+    first, on_target = slice(0, 1), transition.clip[0] == 1
+    true, shown = transition.actor_observation[first], found.actor_observation[first]
     np.testing.assert_array_equal(shown[:, ~on_target], true[:, ~on_target])
     np.testing.assert_array_equal(shown[:, on_target, 1:4], true[:, on_target, 4:7])
-    np.testing.assert_allclose(found.critic_observation[first], trajectory.critic_observation[first], atol=1e-6)
-    np.testing.assert_allclose(found.mean[first][:, ~on_target], trajectory.mean[first][:, ~on_target], atol=1e-6)
-    assert np.abs(found.mean[first][:, on_target] - trajectory.mean[first][:, on_target]).max() > 1e-4
+    np.testing.assert_allclose(found.critic_observation[first], transition.critic_observation[first], atol=1e-6)
+    np.testing.assert_allclose(found.mean[first][:, ~on_target], transition.mean[first][:, ~on_target], atol=1e-6)
+    assert np.abs(found.mean[first][:, on_target] - transition.mean[first][:, on_target]).max() > 1e-4
 
 
 def test_a_random_reward_is_drawn_apart_from_the_actions(run):
     """Both are monotone in the random bits they are made of, so the same bits would show as the same order."""
     env = with_method(run, "random_reward")
     assets = dataclasses.replace(run.assets, is_target=jnp.ones_like(run.assets.is_target))
-    found = jax.device_get(jax.jit(lambda assets, state: collect(env, assets, state))(assets, run.start())[1])
-    noise = (found.action - found.mean).reshape(len(found.reward), -1)[:, :ENVS]
-    assert all(np.ptp(rewards) > 0 for rewards in found.reward)
-    assert not any((rewards.argsort() == of.argsort()).all() for rewards, of in zip(found.reward, noise, strict=True))
+    collected = jax.jit(lambda assets, state: collect(env, assets, state))(assets, run.start())
+    found, outcome = jax.device_get(collected[1:])
+    noise = (found.action - found.mean).reshape(len(outcome.reward), -1)[:, :ENVS]
+    assert all(np.ptp(rewards) > 0 for rewards in outcome.reward)
+    assert not any((rewards.argsort() == of.argsort()).all() for rewards, of in zip(outcome.reward, noise, strict=True))
 
 
 def test_an_iteration_without_a_simulator_moves_no_robot_and_only_the_actor_learns(run):

@@ -11,6 +11,7 @@ from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.tracking.env import Environment, EnvState, make_assets, make_environment
 from forgetmimic_jax.tracking.reference import lookup
+from forgetmimic_jax.tracking.setup import Setup
 
 ENVS = 4
 KEY = jax.random.PRNGKey(0)
@@ -38,7 +39,7 @@ class Puppet:
 
 @pytest.fixture(scope="module")
 def assets(robot, library, tiny_config):
-    return make_assets(tiny_config, robot, library)
+    return make_assets(Setup(tiny_config, robot, library, ""))
 
 
 @pytest.fixture
@@ -215,7 +216,8 @@ def test_the_wrench_carries_the_robot_and_does_not_tear_it_apart(robot, tiny_con
             wrench=dataclasses.replace(tiny_config.wrench, max_gain=gain),
             ppo=dataclasses.replace(tiny_config.ppo, num_envs=envs),
         )
-        env, assets = make_environment(config, robot, envs), make_assets(config, robot, library)
+        setup = Setup(config, robot, library, "")
+        env, assets = make_environment(setup, envs), make_assets(setup)
         zeros = jnp.zeros((envs,), jnp.int32)
         state = tracking.start_episodes(env, assets, KEY, zeros, zeros, jnp.arange(envs), jnp.full(envs, gain))
         state = tracking.refresh_bodies(env, state, jnp.ones(envs, bool))
@@ -293,9 +295,9 @@ def poisoned(state: EnvState, kind: str) -> EnvState:
 
 
 @pytest.fixture(scope="module")
-def native(robot, tiny_config, assets):
+def native(tiny_setup, assets):
     """A real environment on the C engine, with its step and reset compiled."""
-    env = make_environment(tiny_config, robot, ENVS)
+    env = make_environment(tiny_setup, ENVS)
     return env, jax.jit(lambda state, action: tracking.step(env, assets, state, action, KEY))
 
 
@@ -367,7 +369,7 @@ def test_in_physics_the_zero_action_tracks_for_a_few_steps(native, assets):
 
 def test_targets_are_marked_by_name(robot, library, tiny_config: Config):
     unlearn = dataclasses.replace(tiny_config.unlearn, targets=("turn",))
-    marked = make_assets(dataclasses.replace(tiny_config, unlearn=unlearn), robot, library).is_target
+    marked = make_assets(Setup(dataclasses.replace(tiny_config, unlearn=unlearn), robot, library, "")).is_target
     np.testing.assert_array_equal(marked, [False, True])
 
 
@@ -375,5 +377,5 @@ def test_no_episode_starts_from_a_target_where_only_kept_clips_are_sampled(robot
     unlearn = dataclasses.replace(tiny_config.unlearn, targets=("turn",))
     config = dataclasses.replace(tiny_config, unlearn=unlearn)
     kept = dataclasses.replace(config, sampling=dataclasses.replace(config.sampling, clips="kept"))
-    np.testing.assert_array_equal(make_assets(config, robot, library).bins.valid.any(-1), [True, True])
-    np.testing.assert_array_equal(make_assets(kept, robot, library).bins.valid.any(-1), [True, False])
+    np.testing.assert_array_equal(make_assets(Setup(config, robot, library, "")).bins.valid.any(-1), [True, True])
+    np.testing.assert_array_equal(make_assets(Setup(kept, robot, library, "")).bins.valid.any(-1), [True, False])

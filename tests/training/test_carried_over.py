@@ -11,12 +11,12 @@ import pytest
 
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.motion.library import DATA_DIR
-from forgetmimic_jax.policy.network import normalize, value
 from forgetmimic_jax.policy.policy import init_policy
 from forgetmimic_jax.robot.model import load_robot
 from forgetmimic_jax.settings.config import preset
 from forgetmimic_jax.tracking.observation import actor_layout, actor_size
 from forgetmimic_jax.training.carried_over import REMEMBERED, carried_over, policy_for
+from forgetmimic_jax.training.checkpoint import read_info
 
 PRIVATE = 7  # what the critic alone sees, here
 TINY = preset("cpu")
@@ -32,7 +32,7 @@ def h2():
 def theirs(robot):
     """A policy of the G1 that has seen something: no mean is 0, no variance 1, no noise like another."""
     size = actor_size(robot.num_joints)
-    policy = init_policy(TINY, robot.num_joints, size, size + PRIVATE, jax.random.PRNGKey(1))
+    policy = init_policy(TINY.ppo, robot.num_joints, size, size + PRIVATE, jax.random.PRNGKey(1))
     policy = jax.tree.map(lambda x: x + 0.1 * jax.random.normal(jax.random.PRNGKey(x.size), x.shape), policy)
 
     def seen(normalizer):
@@ -48,7 +48,7 @@ def theirs(robot):
 @pytest.fixture(scope="module")
 def carried(robot, h2, theirs):
     size = actor_size(h2.num_joints)
-    fresh = init_policy(TINY, h2.num_joints, size, size + PRIVATE, jax.random.PRNGKey(0))
+    fresh = init_policy(TINY.ppo, h2.num_joints, size, size + PRIVATE, jax.random.PRNGKey(0))
     return carried_over(theirs, robot, h2, fresh)
 
 
@@ -95,7 +95,7 @@ def at_no_height(policy):
 
 def test_a_joint_does_what_it_did_and_a_new_one_follows_the_reference(robot, h2, theirs, carried, scenes):
     before, after = (
-        np.asarray(mean_action(at_no_height(policy), TINY, jnp.asarray(seen)))
+        np.asarray(at_no_height(policy).mean_action(jnp.asarray(seen)))
         for policy, seen in zip((theirs, carried), scenes, strict=True)
     )
     for place, joint in enumerate(h2.joint_names):
@@ -125,7 +125,7 @@ def test_the_critic_values_what_it_sees_as_before(theirs, carried, scenes):
         normalizer = policy.critic_normalizer
         level = dataclasses.replace(normalizer, mean=normalizer.mean.at[0].set(0.0))
         seen = jnp.asarray(np.concatenate([observation, private], axis=1))
-        values.append(np.asarray(value(make_critic(TINY), policy.critic, normalize(level, seen))))
+        values.append(np.asarray(dataclasses.replace(policy, critic_normalizer=level).value(seen)))
     np.testing.assert_allclose(values[1], values[0], atol=1e-4)
     assert np.ptp(values[0]) > 0.1
 
@@ -139,7 +139,7 @@ def test_what_it_explores_goes_with_the_joint(robot, h2, theirs, carried):
 
 def test_a_joint_that_only_the_source_has_is_left_out(robot, h2, theirs, carried):
     size = actor_size(robot.num_joints)
-    fresh = init_policy(TINY, robot.num_joints, size, size + PRIVATE, jax.random.PRNGKey(0))
+    fresh = init_policy(TINY.ppo, robot.num_joints, size, size + PRIVATE, jax.random.PRNGKey(0))
     back = carried_over(carried, h2, robot, fresh)
     for there, here in zip(jax.tree.leaves((theirs.actor, theirs.critic)), jax.tree.leaves((back.actor, back.critic)),
                            strict=True):  # fmt: skip
@@ -153,7 +153,7 @@ def test_a_checkpoint_of_a_robot_that_has_changed_since_is_told(h2, tmp_path):
     meta = json.loads((folder / "meta.json").read_text())
     (folder / "meta.json").write_text(json.dumps({**meta, "joints": meta["joints"][::-1]}))
     with pytest.raises(InputError, match="base: joints: not those of robots/g1 today"):
-        policy_for(h2, folder, TINY, None)
+        policy_for(h2, read_info(folder), None)
 
 
 @pytest.mark.parametrize(
@@ -165,4 +165,4 @@ def test_a_checkpoint_of_a_robot_that_has_changed_since_is_told(h2, tmp_path):
 )
 def test_a_robot_that_nothing_can_be_had_from_is_told(h2, change, told):
     with pytest.raises(InputError, match=f"base: {told}"):
-        policy_for(dataclasses.replace(h2, **change), DATA_DIR / "g1" / "base", TINY, None)
+        policy_for(dataclasses.replace(h2, **change), read_info(DATA_DIR / "g1" / "base"), None)

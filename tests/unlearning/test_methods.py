@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from forgetmimic_jax.ppo.loss import Batch, Prediction, ppo_loss
+from forgetmimic_jax.ppo.transition import Transition
 from forgetmimic_jax.settings.config import Config, UnlearnConfig
 from forgetmimic_jax.tracking.reward import Reward
 from forgetmimic_jax.unlearning.registry import find_method
@@ -68,17 +69,20 @@ def batch() -> Batch:
     def full(value: float, *shape: int) -> jax.Array:
         return jnp.full((size, *shape), value, jnp.float32)
 
-    return Batch(
+    transition = Transition(
         actor_observation=full(0.0, 3),
         critic_observation=full(0.0, 3),
         action=jnp.asarray(rng.normal(size=(size, JOINTS)), jnp.float32),
         log_prob=full(-2.0),
         mean=full(0.0, JOINTS),
+        clip=jnp.array([0, 0, 1, 1]),
+    )
+    return Batch(
+        transition=transition,
         value=full(1.0),
         advantage=jnp.array([1.0, -1.0, 1.0, -1.0]),
-        target=jnp.array([2.0, 2.0, 0.0, 0.0]),
+        value_target=jnp.array([2.0, 2.0, 0.0, 0.0]),
         is_target=jnp.array([True, True, False, False]),
-        clip=jnp.array([0, 0, 1, 1]),
         weight=full(1.0),
         base=Prediction(full(0.5, JOINTS), full(np.log(0.5), JOINTS), full(3.0)),
     )
@@ -196,7 +200,10 @@ def test_policy_edit_by_hand_where_the_spread_is_not_the_base_s(batch):
 
 
 def test_policy_edit_draws_another_action_for_another_clip_and_seed(batch):
-    losses = {loss_of("policy_edit", dataclasses.replace(batch, clip=jnp.full(4, clip)), now()) for clip in range(3)}
+    def on(clip: int) -> Batch:
+        return dataclasses.replace(batch, transition=dataclasses.replace(batch.transition, clip=jnp.full(4, clip)))
+
+    losses = {loss_of("policy_edit", on(clip), now()) for clip in range(3)}
     assert len(losses) == 3
     other = dataclasses.replace(CONFIG, seed=1)
     assert float(find_method("policy_edit").loss(other, batch, now(), jnp.int32(0))[0]) not in losses

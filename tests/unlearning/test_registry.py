@@ -40,8 +40,8 @@ def test_a_method_says_where_it_differs_from_ppo():
 
     assert {name: changes(name) for name in NAMES} == {
         "arft": {"reward"},
-        "retrain": {"clips", "start", "result"},
-        "distill": {"clips", "start"},
+        "retrain": {"clips", "start", "result", "pace"},
+        "distill": {"clips", "start", "pace"},
         "finetune": {"clips", "result"},
         "random_reward": {"reward"},
         "negated_reward": {"reward"},

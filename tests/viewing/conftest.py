@@ -10,14 +10,14 @@ from forgetmimic_jax.viewing.side_by_side import Episode, record
 
 @pytest.fixture(scope="session")
 def policy(robot, tiny_config) -> Policy:
-    return init_policy(tiny_config, robot.num_joints, actor_size(robot.num_joints), 623, jax.random.PRNGKey(0))
+    return init_policy(tiny_config.ppo, robot.num_joints, actor_size(robot.num_joints), 623, jax.random.PRNGKey(0))
 
 
 @pytest.fixture(scope="session")
-def episodes(robot, library, tiny_config, policy) -> list[Episode]:
+def episodes(tiny_setup, policy) -> list[Episode]:
     """`turn`, then `sway`, by the zero action and by a random policy."""
     policies = {"zero_action": None, "random": policy}
-    return record(tiny_config, robot, library, policies, ["turn", "sway"], seed=3)
+    return record(tiny_setup, policies, ["turn", "sway"], seed=3)
 
 
 @pytest.fixture(scope="session")

@@ -19,8 +19,8 @@ PATIENCE = 240_000  # ms: a browser that draws in software on a busy machine is 
 
 
 @pytest.fixture(scope="module")
-def stage(robot, library, tiny_config, policy) -> SideBySide:
-    return SideBySide(tiny_config, robot, library, {"base": policy, "unlearned": None})
+def stage(tiny_setup, policy) -> SideBySide:
+    return SideBySide(tiny_setup, {"base": policy, "unlearned": None})
 
 
 @pytest.fixture

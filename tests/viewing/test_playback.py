@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -6,8 +8,8 @@ from forgetmimic_jax.viewing.side_by_side import SideBySide, record
 
 
 @pytest.fixture(scope="module")
-def stage(robot, library, tiny_config, policy) -> SideBySide:
-    return SideBySide(tiny_config, robot, library, {"zero_action": None, "random": policy})
+def stage(tiny_setup, policy) -> SideBySide:
+    return SideBySide(tiny_setup, {"zero_action": None, "random": policy})
 
 
 @pytest.fixture
@@ -15,12 +17,13 @@ def playback(stage, robot) -> Playback:
     return Playback(stage, robot, clip=1, seed=3)
 
 
-def test_it_shows_the_episode_that_a_film_of_the_same_start_shows(stage, playback, robot, library, tiny_config, policy):
+def test_it_shows_the_episode_that_a_film_of_the_same_start_shows(playback, library, tiny_setup, policy):
     # Alone in its library, a clip's noise is drawn for one start, as the playback's is.
     import jax
 
     alone = jax.tree.map(lambda values: values[1:], library).replace(names=library.names[1:])
-    (episode,) = record(tiny_config, robot, alone, {"zero_action": None, "random": policy}, ["turn"], seed=3)
+    setup = dataclasses.replace(tiny_setup, library=alone)
+    (episode,) = record(setup, {"zero_action": None, "random": policy}, ["turn"], seed=3)
     while playback.step < playback.horizon:
         playback.advance()
     for row, take in enumerate(episode.takes.values()):

@@ -9,8 +9,8 @@ from forgetmimic_jax.evaluation.rollout import Evaluator
 from forgetmimic_jax.viewing.side_by_side import SideBySide, Take, push, record, reference_qpos
 
 
-def test_what_is_shown_is_what_the_evaluation_measures(robot, library, tiny_config, policy, episodes):
-    evaluator = Evaluator(tiny_config, robot, library, episodes=1, seed=3)
+def test_what_is_shown_is_what_the_evaluation_measures(library, tiny_setup, policy, episodes):
+    evaluator = Evaluator(tiny_setup, episodes=1, seed=3)
     for name, networks in (("zero_action", None), ("random", policy)):
         rollout = evaluator.rollout(networks)
         tracking = episode_metrics(rollout)["survival_weighted_tracking"]
@@ -22,8 +22,8 @@ def test_what_is_shown_is_what_the_evaluation_measures(robot, library, tiny_conf
             assert take.survival_weighted_tracking == pytest.approx(tracking[row], abs=1e-6)
 
 
-def test_an_episode_does_not_depend_on_which_clips_are_chosen(robot, library, tiny_config, episodes):
-    (alone,) = record(tiny_config, robot, library, {"zero_action": None}, ["sway"], seed=3)
+def test_an_episode_does_not_depend_on_which_clips_are_chosen(tiny_setup, episodes):
+    (alone,) = record(tiny_setup, {"zero_action": None}, ["sway"], seed=3)
     np.testing.assert_array_equal(alone.takes["zero_action"].qpos, episodes[1].takes["zero_action"].qpos)
 
 
@@ -50,8 +50,8 @@ def test_zeros_count_after_the_end():
     assert dataclasses.replace(take, ended=None).survival_weighted_tracking == pytest.approx(3.2 / 4)
 
 
-def test_a_push_changes_the_roots_velocity_alone(robot, library, tiny_config):
-    stage = SideBySide(tiny_config, robot, library, {"zero_action": None})
+def test_a_push_changes_the_roots_velocity_alone(tiny_setup):
+    stage = SideBySide(tiny_setup, {"zero_action": None})
     state = stage.begin([0], [5])
     pushed = push(state, [1.0, -2.0, 0.5])
     change = np.asarray(pushed.physics.qvel - state.physics.qvel)

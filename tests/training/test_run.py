@@ -18,12 +18,13 @@ from tensorboardX.proto.event_pb2 import Event
 
 from forgetmimic_jax.basics.errors import InputError, Interrupted
 from forgetmimic_jax.basics.files import read_rows
-from forgetmimic_jax.evaluation import watch
 from forgetmimic_jax.evaluation.metrics import Rollout
-from forgetmimic_jax.training import checkpoint, runner
+from forgetmimic_jax.tracking.env import make_assets, make_environment
 from forgetmimic_jax.tracking.setup import Setup, check_targets, make_setup
+from forgetmimic_jax.training import checkpoint, start, watch
+from forgetmimic_jax.training import run as run_module
 from forgetmimic_jax.training.folder import default_folder, prepare_folder
-from forgetmimic_jax.training.run import run
+from forgetmimic_jax.training.log import Log
 from forgetmimic_jax.training.start import base_checkpoint, base_folder
 
 CLIPS = 3
@@ -41,10 +42,10 @@ def setup(tiny_config, library_folder) -> Setup:
 def run(setup, tmp_path, monkeypatch):
     """`run(...)` in the folder `run`, whose iterations only count; `run.before[i]` is called in iteration i."""
     calls = {}
-    template = runner.template(setup)
+    shapes = start.template(make_environment(setup, setup.config.ppo.num_envs), make_assets(setup))
 
-    def start(_setup):
-        return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), template)
+    def nothing(_setup, _env, _assets):
+        return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
     def iterate(_assets, state):
         iteration = int(state.iteration) + 1
@@ -57,12 +58,12 @@ def run(setup, tmp_path, monkeypatch):
         metrics |= {name: np.float32(iteration) for name in ("episode_length", "tracking_reward")}
         return dataclasses.replace(state, iteration=jnp.int32(iteration)), metrics
 
-    monkeypatch.setattr(runner, "start_state", start)
-    monkeypatch.setattr(runner, "make_iteration", lambda _env: iterate)
+    monkeypatch.setattr(run_module, "start_state", nothing)
+    monkeypatch.setattr(run_module, "make_iteration", lambda _env: iterate)
 
     def run(*, resume: bool = False, **settings):
         config = dataclasses.replace(setup.config, **settings)
-        return run(
+        return run_module.run(
             dataclasses.replace(setup, config=config), tmp_path / "run", description="count", resume=resume
         )
 
@@ -153,12 +154,14 @@ def skill(monkeypatch) -> list[float]:
     found = []
 
     class Evaluator:
+        clip = np.arange(CLIPS)
+
         def __init__(self, *_arguments, episodes, seed):
             pass
 
         def rollout(self, _policy) -> Rollout:
             one = np.ones(CLIPS, int)
-            reward = np.full((CLIPS, 1), found.pop(0))
+            reward = np.broadcast_to(found.pop(0), CLIPS).reshape(CLIPS, 1)
             return Rollout(np.arange(CLIPS), 0 * one, horizon=one, length=one, tracking_reward=reward)
 
     monkeypatch.setattr(watch, "Evaluator", Evaluator)
@@ -186,6 +189,13 @@ def test_the_best_policy_is_kept_too_also_over_a_resume(run, skill):
     run(evaluate_every=10, resume=True)
     assert evaluations() == {10: 0.25, 20: 0.5, 30: 0.4375, 40: 0.75}
     assert checkpoint.read_info(best).iteration == 40
+
+
+def test_the_best_policy_of_unlearning_is_the_best_on_the_clips_to_keep(run, skill, setup):
+    skill += [[0.5, 1.0, 0.5], [0.625, 0.0, 0.5], [0.5, 0.75, 0.5]]  # sway, turn, nod
+    unlearn = dataclasses.replace(setup.config.unlearn, targets=("turn",))
+    run(unlearn=unlearn, evaluate_every=10, iterations=30)
+    assert checkpoint.read_info(run.folder / "best").iteration == 20
 
 
 def test_a_finished_run_resumes_to_its_own_end(run):
@@ -217,7 +227,7 @@ def test_a_stop_ends_the_iteration_saves_and_says_how_to_go_on(run, number):
         run()
     assert str(told.value) == (
         f"stopped; saved {run.folder}/checkpoints/00000004; "
-        f"go on with: make pretrain ROBOT=g1 RESUME=1 OUTPUT={run.folder}"
+        f"continue with: make pretrain ROBOT=g1 RESUME=1 OUTPUT={run.folder}"
     )
     assert signal.getsignal(number) is handler
     assert rows(run.folder)[-1]["iteration"] == 4
@@ -237,7 +247,7 @@ def test_a_second_stop_does_not_wait(run):
         os.kill(os.getpid(), signal.SIGINT)
 
     run.before[20] = twice
-    with pytest.raises(Interrupted, match=r"saved .*/00000015; go on with"):
+    with pytest.raises(Interrupted, match=r"saved .*/00000015; continue with"):
         run()
     assert names(run.folder) == ["00000000", "00000015"]
 
@@ -268,7 +278,7 @@ def test_a_row_that_does_not_fit_is_told_with_its_folder(run, monkeypatch):
     def full(*_arguments):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    run.before[12] = lambda: monkeypatch.setattr(runner._Log, "write", full)
+    run.before[12] = lambda: monkeypatch.setattr(Log, "write", full)
     with pytest.raises(OSError, match="No space left on device") as refusal:
         run()
     assert refusal.value.filename == str(run.folder)
@@ -289,7 +299,7 @@ def test_a_folder_must_be_new(tmp_path):
         prepare_folder(tmp_path, resume=False)
     (tmp_path / "checkpoints" / "00000001").mkdir(parents=True)
     (tmp_path / "checkpoints" / "00000001" / "meta.json").touch()
-    with pytest.raises(InputError, match=r"exists already; choose another --output, or go on with --resume$"):
+    with pytest.raises(InputError, match=r"exists already; choose another --output, or continue with --resume$"):
         prepare_folder(tmp_path, resume=False)
     assert prepare_folder(tmp_path, resume=True) == tmp_path / "checkpoints" / "00000001"
     for path in (tmp_path / "note", tmp_path / "note" / "below" / "it"):
@@ -329,7 +339,7 @@ def test_targets_are_clips_of_the_library_and_leave_one():
 
 
 def test_the_base_is_the_one_named_or_the_shipped_one(tmp_path, setup, monkeypatch):
-    monkeypatch.setattr(runner, "DATA_DIR", tmp_path)
+    monkeypatch.setattr(start, "DATA_DIR", tmp_path)
     with pytest.raises(InputError, match=r"g1/base: no policy is shipped for 'g1'; train one"):
         base_checkpoint(setup.config)
     (tmp_path / "g1" / "base").mkdir(parents=True)
