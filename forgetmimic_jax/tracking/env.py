@@ -21,7 +21,7 @@ from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.robot.model import Robot, RobotArrays
 from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking import observation, randomise, reward
-from forgetmimic_jax.tracking.reference import Reference, align_to_anchor, lookup
+from forgetmimic_jax.tracking.reference import Reference, align_to_anchor, anchor_between, lookup
 from forgetmimic_jax.tracking.rsi import Bins, make_bins, sample_start
 from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.tracking.termination import terminations
@@ -162,9 +162,12 @@ def reset_where(
     return refresh_bodies(env, _where(mask, fresh, state), mask)
 
 
-def assist(env: Environment, assets: Assets, state: EnvState) -> Array:
-    """The assistive wrench [env, 6] N, N m: β times the reference wrench towards the current frame."""
-    reference = lookup(assets.library, state.clip, state.frame)
+def assist(env: Environment, assets: Assets, state: EnvState, fraction: Array | float = 0.0) -> Array:
+    """The assistive wrench [env, 6] N, N m: β times the reference wrench.
+
+    `fraction` is the part of the control step that is over: the robot is compared with the reference of that time.
+    """
+    reference = anchor_between(assets.library, env.robot.anchor, state.clip, state.frame, fraction)
     wrench = reference_wrench(env.config.wrench, assets.robot, reference, state.bodies, env.robot.anchor)
     return state.wrench_gain[:, None] * wrench
 
@@ -237,19 +240,21 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
 def _live(env: Environment, assets: Assets, state: EnvState, target: Array) -> tuple[PhysicsState, BodyState]:
     """One control step of the physics.
 
-    The wrench is that of each physics step. Its torque is for the inertia of the whole robot and acts on the torso
+    The wrench is renewed for each physics step: before the k-th of n, from 0, the reference is k/n of the way to the
+    next frame. The wrench's torque is for the inertia of the whole robot and acts on the torso
     alone, so its damping, held for a control step, would overshoot and tear the robot apart.
     """
     if env.config.wrench.max_gain == 0:
         nothing = jnp.zeros((env.num_envs, 6), jnp.float32)
         return env.engine.step(state.physics, state.parameters, target, nothing)
 
-    def physics_step(state: EnvState, _: None) -> tuple[EnvState, None]:
-        wrench = assist(env, assets, state)
+    def physics_step(state: EnvState, fraction: Array) -> tuple[EnvState, None]:
+        wrench = assist(env, assets, state, fraction)
         physics, bodies = env.engine.step(state.physics, state.parameters, target, wrench)
         return dataclasses.replace(state, physics=physics, bodies=bodies), None
 
-    state, _ = jax.lax.scan(physics_step, state, length=env.config.physics.substeps)
+    substeps = env.config.physics.substeps
+    state, _ = jax.lax.scan(physics_step, state, jnp.arange(substeps) / substeps)
     return state.physics, state.bodies
 
 

@@ -9,7 +9,7 @@ from forgetmimic_jax.basics import rotation
 from forgetmimic_jax.physics import BodyState
 from forgetmimic_jax.robot.model import RobotArrays
 from forgetmimic_jax.settings.config import WrenchConfig
-from forgetmimic_jax.tracking.reference import Reference
+from forgetmimic_jax.tracking.reference import AnchorMotion
 
 
 def wrench_gain(config: WrenchConfig, failure_level: Array) -> Array:
@@ -18,7 +18,7 @@ def wrench_gain(config: WrenchConfig, failure_level: Array) -> Array:
 
 
 def reference_wrench(
-    config: WrenchConfig, robot: RobotArrays, reference: Reference, bodies: BodyState, anchor: int
+    config: WrenchConfig, robot: RobotArrays, reference: AnchorMotion, bodies: BodyState, anchor: int
 ) -> Array:
     """Force and torque [env, 6] (N, N m; world frame) that would carry the anchor along the reference.
 
@@ -27,17 +27,17 @@ def reference_wrench(
     wbc-mjlab's code does; its torque is the same.
     """
     quat, ang_vel = bodies.quat[:, anchor], bodies.ang_vel[:, anchor]
-    position_pull = config.position_stiffness * (reference.body_pos[:, anchor] - bodies.pos[:, anchor])
-    position_pull += config.position_damping * (reference.body_lin_vel[:, anchor] - bodies.lin_vel[:, anchor])
-    orientation_pull = config.orientation_stiffness * rotation.difference(reference.body_quat[:, anchor], quat)
-    orientation_pull += config.orientation_damping * (reference.body_ang_vel[:, anchor] - ang_vel)
+    position_pull = config.position_stiffness * (reference.pos - bodies.pos[:, anchor])
+    position_pull += config.position_damping * (reference.lin_vel - bodies.lin_vel[:, anchor])
+    orientation_pull = config.orientation_stiffness * rotation.difference(reference.quat, quat)
+    orientation_pull += config.orientation_damping * (reference.ang_vel - ang_vel)
 
     def inertia(vector: Array) -> Array:
         return rotation.rotate(quat, rotation.rotate_inverse(quat, vector) @ robot.inertia.T)
 
-    torque = inertia(reference.anchor_ang_acc + orientation_pull) + jnp.cross(ang_vel, inertia(ang_vel))
+    torque = inertia(reference.ang_acc + orientation_pull) + jnp.cross(ang_vel, inertia(ang_vel))
     if config.law == "wbc":
-        force = robot.mass * reference.anchor_lin_acc + position_pull - robot.gravity
+        force = robot.mass * reference.lin_acc + position_pull - robot.gravity
     else:
-        force = robot.mass * (reference.anchor_lin_acc + position_pull - robot.gravity)
+        force = robot.mass * (reference.lin_acc + position_pull - robot.gravity)
     return jnp.concatenate([force, torque], axis=-1)
