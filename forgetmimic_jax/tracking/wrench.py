@@ -22,9 +22,9 @@ def reference_wrench(
 ) -> Array:
     """Force and torque [env, 6] (N, N m; world frame) that would carry the anchor along the reference.
 
-    F = M (a_ref + k_p e_p + k_d e_v − g); τ = I_w (α_ref + k_R e_R + k_ω e_ω) + ω × I_w ω, with I_w the robot's
-    inertia turned to the world by the anchor. `law="wbc"` leaves M off the gain and gravity terms of the force, as
-    wbc-mjlab's code does; its torque is the same.
+    F = M (a_ref + k_p e_p + k_d e_v − g); τ = I_w (α_ref + k_R e_R + k_ω e_ω) + ω × I_w ω, with M the robot's mass and
+    I_w its inertia, turned to the world by the anchor. The paper names a computed-torque controller and gives no
+    formula; docs/method.md says how wbc-mjlab's differs.
     """
     quat, ang_vel = bodies.quat[:, anchor], bodies.ang_vel[:, anchor]
     position_pull = config.position_stiffness * (reference.pos - bodies.pos[:, anchor])
@@ -36,8 +36,5 @@ def reference_wrench(
         return rotation.rotate(quat, rotation.rotate_inverse(quat, vector) @ robot.inertia.T)
 
     torque = inertia(reference.ang_acc + orientation_pull) + jnp.cross(ang_vel, inertia(ang_vel))
-    if config.law == "wbc":
-        force = robot.mass * reference.lin_acc + position_pull - robot.gravity
-    else:
-        force = robot.mass * (reference.lin_acc + position_pull - robot.gravity)
+    force = robot.mass * (reference.lin_acc + position_pull - robot.gravity)
     return jnp.concatenate([force, torque], axis=-1)
