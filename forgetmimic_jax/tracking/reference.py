@@ -80,12 +80,10 @@ def anchor_between(
 
 @struct.dataclass
 class AlignedBodies:
-    """Key bodies of the reference after moving it to the robot's anchor in x, y and yaw (height stays)."""
+    """Poses of the reference's key bodies after moving it to the robot's anchor in x, y and yaw (height stays)."""
 
     pos: Array  # [env, key_body, 3]
     quat: Array  # [env, key_body, 4]
-    lin_vel: Array  # [env, key_body, 3]
-    ang_vel: Array  # [env, key_body, 3]
 
 
 def align_to_anchor(reference: Reference, anchor: int, anchor_pos: Array, anchor_quat: Array) -> AlignedBodies:
@@ -103,6 +101,4 @@ def align_to_anchor(reference: Reference, anchor: int, anchor_pos: Array, anchor
     return AlignedBodies(
         pos=origin + rotation.rotate(turn, reference.body_pos - ref_pos[:, None]),
         quat=rotation.multiply(turn, reference.body_quat),
-        lin_vel=rotation.rotate(turn, reference.body_lin_vel),
-        ang_vel=rotation.rotate(turn, reference.body_ang_vel),
     )

@@ -79,8 +79,8 @@ def tracking_errors(reference: Reference, aligned: AlignedBodies, bodies: BodySt
         "root_angular_velocity": of_anchor(reference.body_ang_vel - bodies.ang_vel),
         "body_position": squared(aligned.pos - bodies.pos).mean(-1),
         "body_orientation": (rotation.angle_between(aligned.quat, bodies.quat) ** 2).mean(-1),
-        "body_linear_velocity": squared(aligned.lin_vel - bodies.lin_vel).mean(-1),
-        "body_angular_velocity": squared(aligned.ang_vel - bodies.ang_vel).mean(-1),
+        "body_linear_velocity": squared(reference.body_lin_vel - bodies.lin_vel).mean(-1),
+        "body_angular_velocity": squared(reference.body_ang_vel - bodies.ang_vel).mean(-1),
         "joint_position": ((reference.joint_pos - joint_pos) ** 2).mean(-1),
         "joint_velocity": ((reference.joint_vel - joint_vel) ** 2).mean(-1),
     }

@@ -30,7 +30,6 @@ PAPER_WEIGHTS = {
     "body_angular_velocity": 0.5,
     "joint_position": 1.0,
 }
-BODY_TERMS = [name for name in PAPER_WEIGHTS if name.startswith("body")]
 ROOT_TERMS = [name for name in PAPER_WEIGHTS if name.startswith("root")]
 QUARTER = np.exp(-0.25)  # a kernel with κ = 1/4 whose error is exactly σ
 WITH_JOINT_VELOCITY = RewardConfig(joint_velocity=1.0)
@@ -135,13 +134,13 @@ def test_sigma_per_joint_is_sigma_root_n_on_the_summed_error(robot):
     np.testing.assert_allclose(terms["joint_position"], np.exp(-0.25 * (offsets @ offsets) / (0.09 * 29)), rtol=1e-4)
 
 
-def test_body_terms_do_not_see_where_the_robot_stands_nor_its_heading(robot, library):
+def test_body_poses_do_not_see_where_the_robot_stands_nor_its_heading(robot, library):
     reference = lookup(library, jnp.array([1]), jnp.array([25]))
     bodies = shaken(on_reference(reference), seed=3)
     here = terms_of(robot, reference, bodies)
     for yaw, shift in [(0.7, (2.0, -1.0)), (-2.5, (0.0, 0.3)), (3.1, (-5.0, 5.0))]:
         there = terms_of(robot, reference, turned(bodies, yaw, shift))
-        for name in [*BODY_TERMS, "joint_position"]:
+        for name in ("body_position", "body_orientation", "joint_position"):
             np.testing.assert_allclose(there[name], here[name], atol=2e-5, err_msg=name)
 
 
@@ -159,6 +158,23 @@ def test_root_velocity_is_compared_in_the_world(robot, library):
     difference = velocity - Rotation.from_euler("z", np.pi / 2).apply(velocity)
     expected = np.exp(-0.25 * (difference @ difference) / 0.36)
     np.testing.assert_allclose(terms_of(robot, reference, bodies)["root_linear_velocity"], expected, rtol=1e-4)
+
+
+def test_a_heading_error_of_half_a_rad_costs_in_the_body_velocities(robot):
+    """wbc-mjlab compares them in the world. A turn by θ moves a horizontal v by 2 v sin(θ/2): 0.9896 m/s of 2 m/s, and
+    1.4844 rad/s of 3 rad/s. Kernels with κ = 1: exp(−0.9896²) = 0.3756 and exp(−(1.4844 / 3.14)²) = 0.7997."""
+    reference, _ = upright_scene(robot)
+    reference = dataclasses.replace(
+        reference,
+        body_lin_vel=reference.body_lin_vel + jnp.array([2.0, 0.0, 0.0]),
+        body_ang_vel=reference.body_ang_vel + jnp.array([0.0, 3.0, 0.0]),
+    )
+    straight = terms_of(robot, reference, on_reference(reference))
+    astray = terms_of(robot, reference, turned(on_reference(reference), 0.5, (0.0, 0.0)))
+    by_hand = {"body_linear_velocity": 0.3756, "body_angular_velocity": 0.7997}
+    for name, value in by_hand.items():
+        np.testing.assert_allclose(straight[name], 1.0, atol=1e-6)
+        np.testing.assert_allclose(astray[name], value, atol=1e-4)
 
 
 def test_height_is_not_aligned_away(robot):
