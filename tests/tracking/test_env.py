@@ -145,6 +145,44 @@ def test_reward_compares_with_the_frame_that_the_step_reaches(puppet_env, assets
     np.testing.assert_array_equal(result.reference.body_pos, rows(assets.library, [0] * ENVS, [11] * ENVS, "body_pos"))
 
 
+def regularisation(env: Environment, assets, *, action=0.0, last_action=0.0, acc_before=0.0, acc=0.0) -> np.ndarray:
+    """R_reg [env] of a step that ends at rest on the next frame; every joint has the values given."""
+    state = start(env, assets, [0, 0, 1, 1], [0, 5, 9, 39])
+    warmstart = jnp.full((ENVS, 35), acc_before).at[:, :6].set(1e6)  # the floating base is no joint
+    state = dataclasses.replace(
+        state,
+        physics=dataclasses.replace(state.physics, warmstart=warmstart),
+        last_action=jnp.full((ENVS, 29), last_action),
+    )
+    physics, bodies = on_frame(env, assets, state.clip, state.frame + 1)
+    env.engine.next_physics = dataclasses.replace(
+        physics, qvel=jnp.zeros((ENVS, 35)), warmstart=jnp.full((ENVS, 35), acc).at[:, :6].set(1e6)
+    )
+    env.engine.next_bodies = bodies
+    _, result = tracking.step(env, assets, state, jnp.full((ENVS, 29), action), KEY)
+    return np.asarray(result.reward.regularisation)
+
+
+def test_a_step_that_ends_at_rest_on_the_reference_gets_the_survival_reward_alone(puppet_env, assets):
+    np.testing.assert_allclose(regularisation(puppet_env, assets), 1.0, atol=1e-5)
+
+
+def test_the_joint_acceleration_that_costs_is_this_steps(puppet_env, assets):
+    found = regularisation(puppet_env, assets, acc_before=-5000.0, acc=-2000.0)
+    np.testing.assert_allclose(found, 1.0 - 5e-6 * 29 * 2000.0, atol=1e-5)  # 0.71
+
+
+def test_the_action_rate_is_against_the_action_of_the_step_before(puppet_env, assets):
+    found = regularisation(puppet_env, assets, action=-0.25, last_action=0.5)
+    np.testing.assert_allclose(found, 1.0 - 0.1 * 29 * 0.75, atol=1e-5)  # −1.175
+
+
+def test_the_torque_that_costs_is_that_towards_the_pd_target(puppet_env, assets):
+    """On the reference at rest, an action of 3.8 is 3.8 · 0.25 = 0.95 of each motor's limit: 0.05 above 0.9."""
+    found = regularisation(puppet_env, assets, action=3.8, last_action=3.8)
+    np.testing.assert_allclose(found, 1.0 - 0.1 * 29 * 0.05, atol=1e-4)  # 0.855
+
+
 def test_a_clips_end_is_a_truncation_at_its_last_frame(puppet_env, assets):
     state = start(puppet_env, assets, [0, 0, 1, 1], [76, 77, 37, 38])  # 80 and 41 frames: 3, 2, 3, 2 steps left
     np.testing.assert_array_equal(state.horizon, [3, 2, 3, 2])
