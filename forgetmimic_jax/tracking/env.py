@@ -56,7 +56,7 @@ class EnvState:
     encoder_bias: Array  # f32[env, joint] rad
     wrench_gain: Array  # f32 β, frozen for the episode
     push_countdown: Array  # i32 control steps to the next push
-    terms: Array  # f32[env, term] last tracking kernels
+    terms: Array  # f32[env, term] kernels of the last step, in the order of `reward.TERMS`
 
 
 @struct.dataclass
@@ -142,7 +142,7 @@ def start_episodes(
         encoder_bias=encoder_bias,
         wrench_gain=wrench_gain,
         push_countdown=randomise.push_interval(noise, keys[3], n, env.control_step),
-        terms=jnp.ones((n, len(reward.tracking_weights(env.config.reward))), jnp.float32),
+        terms=jnp.ones((n, len(reward.TERMS)), jnp.float32),
     )
 
 
@@ -203,8 +203,8 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
 
     joint_pos, joint_vel = physics.qpos[:, 7:], physics.qvel[:, 6:]
     aligned = align_to_anchor(reference, robot.anchor, bodies.pos[:, robot.anchor], bodies.quat[:, robot.anchor])
-    errors = reward.tracking_errors(reference, aligned, bodies, robot.anchor, joint_pos, joint_vel)
-    tracking, normalized, terms = reward.tracking_reward(errors, config.reward)
+    kernels = reward.tracking_kernels(reward.Pair(reference, aligned, bodies, robot.anchor, joint_pos, joint_vel))
+    tracking, normalized = reward.tracking_reward(kernels, config.reward)
     regularisation = reward.regularisation_reward(
         assets.robot,
         config.reward,
@@ -217,7 +217,7 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
     )
     # Where, not a product: a number that overflowed before the divergence was seen would survive a factor of zero.
     result_reward = jax.tree.map(
-        lambda value: jnp.where(diverged, 0.0, value), reward.Reward(tracking, regularisation, normalized, terms)
+        lambda value: jnp.where(diverged, 0.0, value), reward.Reward(tracking, regularisation, normalized, kernels)
     )
     causes = terminations(config.termination, reference, aligned, bodies, robot)
     terminated = diverged | jnp.stack(list(causes.values())).any(0)
@@ -231,7 +231,8 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
         tracking_sum=state.tracking_sum + result_reward.normalized_tracking,
         last_action=action,
         push_countdown=countdown,
-        terms=jnp.stack(list(result_reward.terms.values()), axis=-1),
+        # By name: JAX sorts the keys of a dict.
+        terms=jnp.stack([result_reward.terms[term.name] for term in reward.TERMS], axis=-1),
     )
     truncated = (steps >= state.horizon) & ~terminated
     return new, StepResult(result_reward, terminated, truncated, diverged, causes, reference)

@@ -137,6 +137,21 @@ def test_a_robot_that_follows_exactly_gets_the_whole_reward(puppet_env, assets):
     assert not np.asarray(result.terminated).any()
 
 
+def test_the_critic_sees_the_kernel_of_a_term_with_weight_0(puppet_env, assets):
+    """Joint velocities all 2 rad/s off are one σ: exp(−1/4). No reward is lost, as the term's weight is 0."""
+    state = start(puppet_env, assets, [0, 0, 1, 1], [0, 5, 9, 39])
+    physics, bodies = on_frame(puppet_env, assets, state.clip, state.frame + 1)
+    puppet_env.engine.next_physics = dataclasses.replace(physics, qvel=physics.qvel.at[:, 6:].add(2.0))
+    puppet_env.engine.next_bodies = bodies
+    after, result = tracking.step(puppet_env, assets, state, jnp.zeros((ENVS, 29)), KEY)
+    np.testing.assert_allclose(result.reward.tracking, 8.0, atol=1e-4)
+    assert state.terms.shape == after.terms.shape == (ENVS, 10)
+    np.testing.assert_allclose(after.terms[:, :-1], 1.0, atol=1e-5)
+    np.testing.assert_allclose(after.terms[:, -1], np.exp(-0.25), rtol=1e-4)  # the last of the table
+    critic = tracking.observe(puppet_env, assets, after, None)[1]
+    np.testing.assert_array_equal(critic[:, -52:-42], after.terms)  # before 14 · 3 contact forces
+
+
 def test_reward_compares_with_the_frame_that_the_step_reaches(puppet_env, assets):
     state = start(puppet_env, assets, [0] * ENVS, [10] * ENVS)
     puppet_env.engine.next_physics, puppet_env.engine.next_bodies = state.physics, state.bodies  # it does not move

@@ -11,9 +11,11 @@ from scipy.spatial.transform import Rotation
 from forgetmimic_jax.settings.config import RewardConfig
 from forgetmimic_jax.tracking.reference import align_to_anchor, lookup
 from forgetmimic_jax.tracking.reward import (
+    TERMS,
+    Pair,
     regularisation_reward,
     total_tracking_weight,
-    tracking_errors,
+    tracking_kernels,
     tracking_reward,
     tracking_weights,
 )
@@ -38,13 +40,14 @@ WITH_JOINT_VELOCITY = RewardConfig(joint_velocity=1.0)
 @partial(jax.jit, static_argnums=(0, 1))
 def compiled_reward(config, anchor, reference, bodies, joint_pos, joint_vel):
     aligned = align_to_anchor(reference, anchor, bodies.pos[:, anchor], bodies.quat[:, anchor])
-    return tracking_reward(tracking_errors(reference, aligned, bodies, anchor, joint_pos, joint_vel), config)
+    kernels = tracking_kernels(Pair(reference, aligned, bodies, anchor, joint_pos, joint_vel))
+    return *tracking_reward(kernels, config), kernels
 
 
 def terms_of(robot, reference, bodies, joint_pos=None, joint_vel=None) -> dict[str, np.ndarray]:
     joint_pos = reference.joint_pos if joint_pos is None else joint_pos
     joint_vel = reference.joint_vel if joint_vel is None else joint_vel
-    terms = compiled_reward(WITH_JOINT_VELOCITY, robot.anchor, reference, bodies, joint_pos, joint_vel)[2]
+    terms = compiled_reward(RewardConfig(), robot.anchor, reference, bodies, joint_pos, joint_vel)[2]
     return {name: np.asarray(value) for name, value in terms.items()}
 
 
@@ -53,8 +56,9 @@ def test_weights_are_the_papers_and_sum_to_eight():
     assert total_tracking_weight(RewardConfig()) == sum(PAPER_WEIGHTS.values()) == 8.0
 
 
-def test_a_weight_of_zero_leaves_both_sum_and_mean():
-    assert "joint_velocity" not in tracking_weights(RewardConfig())
+def test_every_term_has_a_weight_in_the_settings_and_zero_leaves_the_sum():
+    assert {term.name for term in TERMS} == {*PAPER_WEIGHTS, "joint_velocity"}
+    assert {term.name for term in TERMS} <= {field.name for field in dataclasses.fields(RewardConfig)}
     assert total_tracking_weight(WITH_JOINT_VELOCITY) == 9.0
 
 
@@ -184,12 +188,18 @@ def test_height_is_not_aligned_away(robot):
 
 
 def test_tracking_reward_is_the_weighted_sum_and_its_mean_lies_in_the_unit_interval():
-    errors = {name: jnp.array([0.3, 1e9]) for name in [*PAPER_WEIGHTS, "joint_velocity"]}
-    total, normalized, terms = tracking_reward(errors, RewardConfig())
-    by_hand = sum(weight * np.asarray(terms[name]) for name, weight in PAPER_WEIGHTS.items())
-    np.testing.assert_allclose(total, by_hand, rtol=1e-6)
-    np.testing.assert_allclose(normalized, by_hand / 8.0, rtol=1e-6)
-    assert float(normalized[1]) == 0.0
+    kernels = {term.name: jnp.array([0.5, 1.0, 0.0]) for term in TERMS} | {
+        "body_linear_velocity": jnp.array([0.1, 1, 0])
+    }
+    total, normalized = tracking_reward(kernels, RewardConfig())
+    np.testing.assert_allclose(total, [7.5 * 0.5 + 0.5 * 0.1, 8.0, 0.0], rtol=1e-6)
+    np.testing.assert_allclose(normalized, [3.8 / 8.0, 1.0, 0.0], rtol=1e-6)
+
+
+def test_a_term_of_weight_zero_has_a_kernel_but_no_part_in_the_reward():
+    kernels = {term.name: jnp.ones(1) for term in TERMS} | {"joint_velocity": jnp.zeros(1)}
+    assert [float(value[0]) for value in tracking_reward(kernels, RewardConfig())] == [8.0, 1.0]
+    assert [float(value[0]) for value in tracking_reward(kernels, WITH_JOINT_VELOCITY)] == [8.0, pytest.approx(8 / 9)]
 
 
 def regularisation(robot, config=RewardConfig(), **changes) -> float:  # noqa: B008 (a frozen dataclass)
