@@ -13,6 +13,7 @@ from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.tracking.env import Environment, EnvState, make_assets, make_environment
 from forgetmimic_jax.tracking.reference import lookup
+from forgetmimic_jax.tracking.setup import Setup
 
 ENVS = 4
 KEY = jax.random.PRNGKey(0)
@@ -290,7 +291,7 @@ def carried(env: Environment, assets, state: EnvState, track: list[dict[str, np.
 
 @pytest.fixture(scope="module")
 def shipped(robot, tiny_config):
-    return make_assets(tiny_config, robot, load_library(robot, clips=["run", "backflip"]))
+    return make_assets(Setup(tiny_config, robot, load_library(robot, clips=["run", "backflip"]), ""))
 
 
 def test_a_robot_on_the_reference_at_every_physics_step_feels_no_pull(robot, puppet_env, shipped):
