@@ -28,7 +28,7 @@ from forgetmimic_jax.evaluation.statistics import Estimate
 from forgetmimic_jax.evaluation.tables import FORGOTTEN, markdown_table, number, percent
 from forgetmimic_jax.evaluation.variants import DEVIATION, within
 from forgetmimic_jax.studies.study import RESULTS
-from forgetmimic_jax.sweep import half_gone_by_seed
+from forgetmimic_jax.sweep import edge, half_gone_by_seed
 
 README = Path(__file__).parent / "README.md"
 BLOCK = re.compile(r"(<!-- claims:start -->\n).*?(<!-- claims:end -->)", re.DOTALL)
@@ -179,11 +179,11 @@ def of_penalty(document: Mapping[str, Any]) -> Iterator[Finding]:
         found = statistics.over_seeds(crossed)
         crit = next(iter(variants.values()))["over_seeds"].get("lambda_crit")
         evidence = f"half of the skill is gone at λ = {number(found, 1)}; λ_crit on the base's steps {number(crit, 2)}"
-        verdict = judged(found, 8.0)
+        verdict = judged(found, edge())
         if len(crossed) < seeds:  # the others need more than was tried
             evidence += f"; in {len(crossed)} of {seeds} seeds, in the others at none that was tried"
             verdict = "open" if verdict == "holds" else verdict
-        yield Finding("forgetting sets in below λ = 8 = W", verdict, evidence, found["n"])
+        yield Finding(f"forgetting sets in below λ = {edge():g} = W", verdict, evidence, found["n"])
 
 
 def of_heat_map(document: Mapping[str, Any]) -> Iterator[Finding]:

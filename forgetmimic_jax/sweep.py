@@ -125,6 +125,14 @@ STUDIES: dict[str, Callable[..., Study]] = {
 }
 
 
+def edge() -> float:
+    """W, the total weight of the tracking terms by default: the penalty at which the paper's algebra turns."""
+    from forgetmimic_jax.settings.config import RewardConfig
+    from forgetmimic_jax.tracking.reward import total_tracking_weight
+
+    return total_tracking_weight(RewardConfig())
+
+
 def _tell_lambda(variants: Mapping[str, Any]) -> str:
     skill = {label: variant["over_seeds"]["policy"]["target"].get("skill", {}) for label, variant in variants.items()}
     forgotten = [label for label, estimate in skill.items() if estimate.get("mean", 1.0) <= FORGOTTEN]
@@ -133,7 +141,7 @@ def _tell_lambda(variants: Mapping[str, Any]) -> str:
     if "lambda_crit" in first:
         lines.append(
             "On the base's own target steps the mean reward changes its sign at λ_crit = W (1 + R_reg / R_track) = "
-            f"{number(first['lambda_crit'], 2)}; W = 8 leaves the other rewards out.\n"
+            f"{number(first['lambda_crit'], 2)}; W = {edge():g} leaves the other rewards out.\n"
         )
     crossed, seeds = half_gone_by_seed(variants)
     if crossed:
@@ -179,7 +187,7 @@ def _draw_lambda(variants: Mapping[str, Any]) -> Figure:
             curve(axes, penalties, of, group)
         axes.set_xscale("log", base=2)
         axes.set_xticks(penalties, [f"{penalty:g}" for penalty in penalties])
-        axes.axvline(8.0, color="0.6", linestyle=":", label="W")
+        axes.axvline(edge(), color="0.6", linestyle=":", label="W")
         crit = next(iter(variants.values()))["over_seeds"].get("lambda_crit")
         if crit:
             axes.axvline(crit["mean"], color="0.3", linestyle="--", label="λ_crit")

@@ -64,6 +64,11 @@ def difference(a: Array, b: Array) -> Array:
     return to_rotation_vector(multiply(a, conjugate(b)))
 
 
+def slerp(a: Array, b: Array, fraction: Array | float) -> Array:
+    """Orientation [..., 4] on the shortest way from a to b at constant speed: `fraction` [..., 1] 0 is a, 1 is b."""
+    return multiply(from_rotation_vector(fraction * difference(b, a)), a)
+
+
 def angle_between(a: Array, b: Array) -> Array:
     """Angle [...] in rad, 0 to π, between two orientations."""
     relative = multiply(a, conjugate(b))

@@ -174,7 +174,7 @@ def _judge(
     anchor = robot.anchor
     aligned = align_to_anchor(reference, anchor, bodies.pos[:, anchor], bodies.quat[:, anchor])
     joint_pos, joint_vel = jnp.asarray(steps["qpos"][:, 7:]), jnp.asarray(steps["qvel"][:, 6:])
-    errors = reward.tracking_errors(reference, aligned, bodies, anchor, joint_pos, joint_vel)
+    kernels = reward.tracking_kernels(reward.Pair(reference, aligned, bodies, anchor, joint_pos, joint_vel))
     causes = terminations(config.termination, reference, aligned, bodies, robot)
-    normalized = reward.tracking_reward(errors, config.reward)[1]
+    normalized = reward.tracking_reward(kernels, config.reward)[1]
     return np.asarray(normalized), np.asarray(jnp.stack(list(causes.values())).any(0))

@@ -128,7 +128,6 @@ class WrenchConfig:
     position_damping: float = 20.0  # k_d, 1/s
     orientation_stiffness: float = 100.0  # k_R, 1/s²
     orientation_damping: float = 20.0  # k_ω, 1/s
-    law: Literal["computed_torque", "wbc"] = "computed_torque"
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.robot.model import Robot, RobotArrays
 from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking import observation, randomise, reward
-from forgetmimic_jax.tracking.reference import Reference, align_to_anchor, lookup
+from forgetmimic_jax.tracking.reference import Reference, align_to_anchor, anchor_between, lookup
 from forgetmimic_jax.tracking.rsi import Bins, make_bins, sample_start
 from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.tracking.termination import terminations
@@ -56,7 +56,7 @@ class EnvState:
     encoder_bias: Array  # f32[env, joint] rad
     wrench_gain: Array  # f32 β, frozen for the episode
     push_countdown: Array  # i32 control steps to the next push
-    terms: Array  # f32[env, term] last tracking kernels
+    terms: Array  # f32[env, term] kernels of the last step, in the order of `reward.TERMS`
 
 
 @struct.dataclass
@@ -142,7 +142,7 @@ def start_episodes(
         encoder_bias=encoder_bias,
         wrench_gain=wrench_gain,
         push_countdown=randomise.push_interval(noise, keys[3], n, env.control_step),
-        terms=jnp.ones((n, len(reward.tracking_weights(env.config.reward))), jnp.float32),
+        terms=jnp.ones((n, len(reward.TERMS)), jnp.float32),
     )
 
 
@@ -162,9 +162,12 @@ def reset_where(
     return refresh_bodies(env, _where(mask, fresh, state), mask)
 
 
-def assist(env: Environment, assets: Assets, state: EnvState) -> Array:
-    """The assistive wrench [env, 6] N, N m: β times the reference wrench towards the current frame."""
-    reference = lookup(assets.library, state.clip, state.frame)
+def assist(env: Environment, assets: Assets, state: EnvState, fraction: Array | float = 0.0) -> Array:
+    """The assistive wrench [env, 6] N, N m: β times the reference wrench.
+
+    `fraction` is the part of the control step that is over: the robot is compared with the reference of that time.
+    """
+    reference = anchor_between(assets.library, env.robot.anchor, state.clip, state.frame, fraction)
     wrench = reference_wrench(env.config.wrench, assets.robot, reference, state.bodies, env.robot.anchor)
     return state.wrench_gain[:, None] * wrench
 
@@ -200,8 +203,8 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
 
     joint_pos, joint_vel = physics.qpos[:, 7:], physics.qvel[:, 6:]
     aligned = align_to_anchor(reference, robot.anchor, bodies.pos[:, robot.anchor], bodies.quat[:, robot.anchor])
-    errors = reward.tracking_errors(reference, aligned, bodies, robot.anchor, joint_pos, joint_vel)
-    tracking, normalized, terms = reward.tracking_reward(errors, config.reward)
+    kernels = reward.tracking_kernels(reward.Pair(reference, aligned, bodies, robot.anchor, joint_pos, joint_vel))
+    tracking, normalized = reward.tracking_reward(kernels, config.reward)
     regularisation = reward.regularisation_reward(
         assets.robot,
         config.reward,
@@ -214,7 +217,7 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
     )
     # Where, not a product: a number that overflowed before the divergence was seen would survive a factor of zero.
     result_reward = jax.tree.map(
-        lambda value: jnp.where(diverged, 0.0, value), reward.Reward(tracking, regularisation, normalized, terms)
+        lambda value: jnp.where(diverged, 0.0, value), reward.Reward(tracking, regularisation, normalized, kernels)
     )
     causes = terminations(config.termination, reference, aligned, bodies, robot)
     terminated = diverged | jnp.stack(list(causes.values())).any(0)
@@ -228,7 +231,8 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
         tracking_sum=state.tracking_sum + result_reward.normalized_tracking,
         last_action=action,
         push_countdown=countdown,
-        terms=jnp.stack(list(result_reward.terms.values()), axis=-1),
+        # By name: JAX sorts the keys of a dict.
+        terms=jnp.stack([result_reward.terms[term.name] for term in reward.TERMS], axis=-1),
     )
     truncated = (steps >= state.horizon) & ~terminated
     return new, StepResult(result_reward, terminated, truncated, diverged, causes, reference)
@@ -237,19 +241,21 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
 def _live(env: Environment, assets: Assets, state: EnvState, target: Array) -> tuple[PhysicsState, BodyState]:
     """One control step of the physics.
 
-    The wrench is that of each physics step. Its torque is for the inertia of the whole robot and acts on the torso
+    The wrench is renewed for each physics step: before the k-th of n, from 0, the reference is k/n of the way to the
+    next frame. The wrench's torque is for the inertia of the whole robot and acts on the torso
     alone, so its damping, held for a control step, would overshoot and tear the robot apart.
     """
     if env.config.wrench.max_gain == 0:
         nothing = jnp.zeros((env.num_envs, 6), jnp.float32)
         return env.engine.step(state.physics, state.parameters, target, nothing)
 
-    def physics_step(state: EnvState, _: None) -> tuple[EnvState, None]:
-        wrench = assist(env, assets, state)
+    def physics_step(state: EnvState, fraction: Array) -> tuple[EnvState, None]:
+        wrench = assist(env, assets, state, fraction)
         physics, bodies = env.engine.step(state.physics, state.parameters, target, wrench)
         return dataclasses.replace(state, physics=physics, bodies=bodies), None
 
-    state, _ = jax.lax.scan(physics_step, state, length=env.config.physics.substeps)
+    substeps = env.config.physics.substeps
+    state, _ = jax.lax.scan(physics_step, state, jnp.arange(substeps) / substeps)
     return state.physics, state.bodies
 
 

@@ -117,7 +117,7 @@ def critic_observation(
         wrench: [env, 6] N, N m.
         wrench_gain: [env] β.
         phase: [env] in [0, 1].
-        terms: [env, term] kernels r_j of the last step.
+        terms: [env, term] kernels r_j of the last step, in the order of `reward.TERMS`.
     """
     pos, quat = bodies.pos[:, anchor], bodies.quat[:, anchor]
     ref_pos, ref_quat = reference.body_pos[:, anchor], reference.body_quat[:, anchor]

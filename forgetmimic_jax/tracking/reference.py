@@ -40,13 +40,50 @@ def lookup(library: MotionLibrary, clip: Array, frame: Array) -> Reference:
 
 
 @struct.dataclass
+class AnchorMotion:
+    """The reference's anchor at one time, which may lie between two frames; world frame."""
+
+    pos: Array  # [env, 3] m
+    quat: Array  # [env, 4]
+    lin_vel: Array  # [env, 3] m/s
+    ang_vel: Array  # [env, 3] rad/s
+    lin_acc: Array  # [env, 3] m/s²
+    ang_acc: Array  # [env, 3] rad/s²
+
+
+def anchor_between(
+    library: MotionLibrary, anchor: int, clip: Array, frame: Array, fraction: Array | float
+) -> AnchorMotion:
+    """The anchor at time `frame` + `fraction` of each clip: orientations by slerp, all else linearly.
+
+    Args:
+        library: the clips.
+        anchor: index of the anchor among the key bodies.
+        clip: [env].
+        frame: [env].
+        fraction: of the way to the next frame, 0 to 1, the same for every environment.
+    """
+    now, following = (lookup(library, clip, frame + ahead) for ahead in (0, 1))
+
+    def between(here: Array, there: Array) -> Array:
+        return here + fraction * (there - here)
+
+    return AnchorMotion(
+        pos=between(now.body_pos[:, anchor], following.body_pos[:, anchor]),
+        quat=rotation.slerp(now.body_quat[:, anchor], following.body_quat[:, anchor], fraction),
+        lin_vel=between(now.body_lin_vel[:, anchor], following.body_lin_vel[:, anchor]),
+        ang_vel=between(now.body_ang_vel[:, anchor], following.body_ang_vel[:, anchor]),
+        lin_acc=between(now.anchor_lin_acc, following.anchor_lin_acc),
+        ang_acc=between(now.anchor_ang_acc, following.anchor_ang_acc),
+    )
+
+
+@struct.dataclass
 class AlignedBodies:
-    """Key bodies of the reference after moving it to the robot's anchor in x, y and yaw (height stays)."""
+    """Poses of the reference's key bodies after moving it to the robot's anchor in x, y and yaw (height stays)."""
 
     pos: Array  # [env, key_body, 3]
     quat: Array  # [env, key_body, 4]
-    lin_vel: Array  # [env, key_body, 3]
-    ang_vel: Array  # [env, key_body, 3]
 
 
 def align_to_anchor(reference: Reference, anchor: int, anchor_pos: Array, anchor_quat: Array) -> AlignedBodies:
@@ -64,6 +101,4 @@ def align_to_anchor(reference: Reference, anchor: int, anchor_pos: Array, anchor
     return AlignedBodies(
         pos=origin + rotation.rotate(turn, reference.body_pos - ref_pos[:, None]),
         quat=rotation.multiply(turn, reference.body_quat),
-        lin_vel=rotation.rotate(turn, reference.body_lin_vel),
-        ang_vel=rotation.rotate(turn, reference.body_ang_vel),
     )

@@ -6,6 +6,9 @@ Tracking: R_track = Σ_j w_j r_j with r_j = exp(−κ_j e_j / σ_j²). Terms the
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import NamedTuple
+
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
@@ -16,19 +19,59 @@ from forgetmimic_jax.robot.model import RobotArrays
 from forgetmimic_jax.settings.config import RewardConfig
 from forgetmimic_jax.tracking.reference import AlignedBodies, Reference
 
-# (κ, σ) of every tracking term; its weight is the field of the same name in RewardConfig.
-KERNELS: dict[str, tuple[float, float]] = {
-    "root_position": (0.25, 0.4),  # m
-    "root_orientation": (0.25, 0.5),  # rad
-    "root_linear_velocity": (0.25, 0.6),  # m/s
-    "root_angular_velocity": (0.25, 1.5),  # rad/s
-    "body_position": (0.25, 0.2),  # m
-    "body_orientation": (0.25, 0.4),  # rad
-    "body_linear_velocity": (1.0, 1.0),  # m/s
-    "body_angular_velocity": (1.0, 3.14),  # rad/s
-    "joint_position": (0.25, 0.3),  # rad
-    "joint_velocity": (0.25, 2.0),  # rad/s
-}
+
+class Pair(NamedTuple):
+    """A robot and the reference frame that it is compared with."""
+
+    reference: Reference
+    aligned: AlignedBodies  # the reference's key bodies, moved to the robot's anchor
+    bodies: BodyState  # the robot's
+    anchor: int  # index of the anchor among the key bodies
+    joint_pos: Array  # [env, joint] rad, the robot's
+    joint_vel: Array  # [env, joint] rad/s
+
+
+class TrackingTerm(NamedTuple):
+    """One tracking term r = exp(−κ e / σ²). Its weight is the field of the same name in RewardConfig."""
+
+    name: str
+    kappa: float
+    sigma: float
+    error: Callable[[Pair], Array]  # e [env], in the square of σ's unit
+
+
+def _square(error: Array) -> Array:
+    return jnp.sum(error**2, axis=-1)
+
+
+def _angle(a: Array, b: Array) -> Array:
+    return rotation.angle_between(a, b) ** 2
+
+
+# "Body frame" in the paper's root velocities is the robot's for both sides, which leaves the norm of the world-frame
+# difference.
+TERMS: tuple[TrackingTerm, ...] = (
+    TrackingTerm("root_position", 0.25, 0.4,  # m
+                 lambda p: _square(p.reference.body_pos - p.bodies.pos)[:, p.anchor]),
+    TrackingTerm("root_orientation", 0.25, 0.5,  # rad
+                 lambda p: _angle(p.reference.body_quat, p.bodies.quat)[:, p.anchor]),
+    TrackingTerm("root_linear_velocity", 0.25, 0.6,  # m/s
+                 lambda p: _square(p.reference.body_lin_vel - p.bodies.lin_vel)[:, p.anchor]),
+    TrackingTerm("root_angular_velocity", 0.25, 1.5,  # rad/s
+                 lambda p: _square(p.reference.body_ang_vel - p.bodies.ang_vel)[:, p.anchor]),
+    TrackingTerm("body_position", 0.25, 0.2,  # m
+                 lambda p: _square(p.aligned.pos - p.bodies.pos).mean(-1)),
+    TrackingTerm("body_orientation", 0.25, 0.4,  # rad
+                 lambda p: _angle(p.aligned.quat, p.bodies.quat).mean(-1)),
+    TrackingTerm("body_linear_velocity", 1.0, 1.0,  # m/s
+                 lambda p: _square(p.reference.body_lin_vel - p.bodies.lin_vel).mean(-1)),
+    TrackingTerm("body_angular_velocity", 1.0, 3.14,  # rad/s
+                 lambda p: _square(p.reference.body_ang_vel - p.bodies.ang_vel).mean(-1)),
+    TrackingTerm("joint_position", 0.25, 0.3,  # rad
+                 lambda p: ((p.reference.joint_pos - p.joint_pos) ** 2).mean(-1)),
+    TrackingTerm("joint_velocity", 0.25, 2.0,  # rad/s
+                 lambda p: ((p.reference.joint_vel - p.joint_vel) ** 2).mean(-1)),
+)  # fmt: skip
 
 
 @struct.dataclass
@@ -38,60 +81,30 @@ class Reward:
     tracking: Array  # [env] R_track
     regularisation: Array  # [env] R_reg
     normalized_tracking: Array  # [env] r̄ in [0, 1]
-    terms: dict[str, Array]  # [env] r_j of the tracking terms
+    terms: dict[str, Array]  # [env] r_j of every tracking term, also of those with weight 0
 
 
 def tracking_weights(config: RewardConfig) -> dict[str, float]:
     """Weights w_j > 0 of the tracking terms."""
-    weights = {name: getattr(config, name) for name in KERNELS}
+    weights = {term.name: getattr(config, term.name) for term in TERMS}
     return {name: weight for name, weight in weights.items() if weight > 0}
 
 
 def total_tracking_weight(config: RewardConfig) -> float:
-    """W = Σ_{w_j > 0} w_j."""
+    """W = Σ_{w_j > 0} w_j; 8 with the paper's weights."""
     return sum(tracking_weights(config).values())
 
 
-def tracking_errors(reference: Reference, aligned: AlignedBodies, bodies: BodyState, anchor: int, joint_pos: Array,
-                    joint_vel: Array) -> dict[str, Array]:  # fmt: skip
-    """Squared errors e_j [env] of every tracking term.
-
-    Args:
-        reference: the frame tracked.
-        aligned: its key bodies, moved to the robot's anchor.
-        bodies: the robot's key bodies.
-        anchor: index of the anchor among the key bodies.
-        joint_pos: [env, joint] rad.
-        joint_vel: [env, joint] rad/s.
-    """
-
-    def squared(error: Array) -> Array:
-        return jnp.sum(error**2, axis=-1)
-
-    def of_anchor(error: Array) -> Array:
-        return squared(error[:, anchor])
-
-    return {
-        "root_position": of_anchor(reference.body_pos - bodies.pos),
-        "root_orientation": rotation.angle_between(reference.body_quat[:, anchor], bodies.quat[:, anchor]) ** 2,
-        # "Body frame" in the paper is the robot's for both sides, which leaves the norm of the world-frame difference.
-        "root_linear_velocity": of_anchor(reference.body_lin_vel - bodies.lin_vel),
-        "root_angular_velocity": of_anchor(reference.body_ang_vel - bodies.ang_vel),
-        "body_position": squared(aligned.pos - bodies.pos).mean(-1),
-        "body_orientation": (rotation.angle_between(aligned.quat, bodies.quat) ** 2).mean(-1),
-        "body_linear_velocity": squared(aligned.lin_vel - bodies.lin_vel).mean(-1),
-        "body_angular_velocity": squared(aligned.ang_vel - bodies.ang_vel).mean(-1),
-        "joint_position": ((reference.joint_pos - joint_pos) ** 2).mean(-1),
-        "joint_velocity": ((reference.joint_vel - joint_vel) ** 2).mean(-1),
-    }
+def tracking_kernels(pair: Pair) -> dict[str, Array]:
+    """r_j [env] in [0, 1] of every tracking term."""
+    return {term.name: jnp.exp(-term.kappa * term.error(pair) / term.sigma**2) for term in TERMS}
 
 
-def tracking_reward(errors: dict[str, Array], config: RewardConfig) -> tuple[Array, Array, dict[str, Array]]:
-    """R_track [env], r̄ [env] and the kernels r_j [env] of the terms with a positive weight."""
+def tracking_reward(kernels: dict[str, Array], config: RewardConfig) -> tuple[Array, Array]:
+    """R_track = Σ_j w_j r_j [env] and r̄ = R_track / W [env] in [0, 1]."""
     weights = tracking_weights(config)
-    terms = {name: jnp.exp(-KERNELS[name][0] * errors[name] / KERNELS[name][1] ** 2) for name in weights}
-    tracking = jnp.stack([weight * terms[name] for name, weight in weights.items()]).sum(0)
-    return tracking, tracking / total_tracking_weight(config), terms
+    tracking = jnp.stack([weight * kernels[name] for name, weight in weights.items()]).sum(0)
+    return tracking, tracking / total_tracking_weight(config)
 
 
 def regularisation_reward(

@@ -2,7 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from forgetmimic_jax.basics import rotation
 
@@ -61,6 +61,15 @@ def test_difference_takes_b_to_a(turns):
     a, b = turns
     step = rotation.from_rotation_vector(rotation.difference(wxyz(a), wxyz(b)))
     same_turn(rotation.multiply(step, wxyz(b)), wxyz(a))
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.25, 0.7, 1.0])
+def test_slerp_is_scipys(turns, fraction):
+    for a, b in zip(*(wxyz(turn)[:20] for turn in turns), strict=True):
+        both = Rotation.from_quat([a, b], scalar_first=True)
+        expected = wxyz(Slerp([0.0, 1.0], both)(fraction))
+        same_turn(rotation.slerp(a, b, fraction), expected)
+        same_turn(rotation.slerp(a, -b, fraction), expected)
 
 
 def test_angle_between(turns):

@@ -5,7 +5,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation, Slerp
 
+from forgetmimic_jax.motion.library import load_library
 from forgetmimic_jax.physics import BodyState, PhysicsParameters, PhysicsState
 from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking import env as tracking
@@ -26,12 +28,13 @@ class Puppet:
     target: jax.Array | None = None
     wrench: jax.Array | None = None
     wrenches: list[jax.Array] = field(default_factory=list)
+    route: list[BodyState] = field(default_factory=list)  # where the next physics steps take it, before next_bodies
     physics: PhysicsState | None = None
 
     def step(self, state: PhysicsState, parameters: PhysicsParameters, target, wrench):
         self.physics, self.target, self.wrench = state, target, wrench
         self.wrenches.append(wrench)
-        return self.next_physics or state, self.next_bodies
+        return self.next_physics or state, self.route.pop(0) if self.route else self.next_bodies
 
     def forward(self, state: PhysicsState, parameters: PhysicsParameters, mask, bodies: BodyState) -> BodyState:
         return bodies
@@ -135,12 +138,65 @@ def test_a_robot_that_follows_exactly_gets_the_whole_reward(puppet_env, assets):
     assert not np.asarray(result.terminated).any()
 
 
+def test_the_critic_sees_the_kernel_of_a_term_with_weight_0(puppet_env, assets):
+    """Joint velocities all 2 rad/s off are one σ: exp(−1/4). No reward is lost, as the term's weight is 0."""
+    state = start(puppet_env, assets, [0, 0, 1, 1], [0, 5, 9, 39])
+    physics, bodies = on_frame(puppet_env, assets, state.clip, state.frame + 1)
+    puppet_env.engine.next_physics = dataclasses.replace(physics, qvel=physics.qvel.at[:, 6:].add(2.0))
+    puppet_env.engine.next_bodies = bodies
+    after, result = tracking.step(puppet_env, assets, state, jnp.zeros((ENVS, 29)), KEY)
+    np.testing.assert_allclose(result.reward.tracking, 8.0, atol=1e-4)
+    assert state.terms.shape == after.terms.shape == (ENVS, 10)
+    np.testing.assert_allclose(after.terms[:, :-1], 1.0, atol=1e-5)
+    np.testing.assert_allclose(after.terms[:, -1], np.exp(-0.25), rtol=1e-4)  # the last of the table
+    critic = tracking.observe(puppet_env, assets, after, None)[1]
+    np.testing.assert_array_equal(critic[:, -52:-42], after.terms)  # before 14 · 3 contact forces
+
+
 def test_reward_compares_with_the_frame_that_the_step_reaches(puppet_env, assets):
     state = start(puppet_env, assets, [0] * ENVS, [10] * ENVS)
     puppet_env.engine.next_physics, puppet_env.engine.next_bodies = state.physics, state.bodies  # it does not move
     _, result = tracking.step(puppet_env, assets, state, jnp.zeros((ENVS, 29)), KEY)
     assert (np.asarray(result.reward.normalized_tracking) < 0.9999).all()
     np.testing.assert_array_equal(result.reference.body_pos, rows(assets.library, [0] * ENVS, [11] * ENVS, "body_pos"))
+
+
+def regularisation(env: Environment, assets, *, action=0.0, last_action=0.0, acc_before=0.0, acc=0.0) -> np.ndarray:
+    """R_reg [env] of a step that ends at rest on the next frame; every joint has the values given."""
+    state = start(env, assets, [0, 0, 1, 1], [0, 5, 9, 39])
+    warmstart = jnp.full((ENVS, 35), acc_before).at[:, :6].set(1e6)  # the floating base is no joint
+    state = dataclasses.replace(
+        state,
+        physics=dataclasses.replace(state.physics, warmstart=warmstart),
+        last_action=jnp.full((ENVS, 29), last_action),
+    )
+    physics, bodies = on_frame(env, assets, state.clip, state.frame + 1)
+    env.engine.next_physics = dataclasses.replace(
+        physics, qvel=jnp.zeros((ENVS, 35)), warmstart=jnp.full((ENVS, 35), acc).at[:, :6].set(1e6)
+    )
+    env.engine.next_bodies = bodies
+    _, result = tracking.step(env, assets, state, jnp.full((ENVS, 29), action), KEY)
+    return np.asarray(result.reward.regularisation)
+
+
+def test_a_step_that_ends_at_rest_on_the_reference_gets_the_survival_reward_alone(puppet_env, assets):
+    np.testing.assert_allclose(regularisation(puppet_env, assets), 1.0, atol=1e-5)
+
+
+def test_the_joint_acceleration_that_costs_is_this_steps(puppet_env, assets):
+    found = regularisation(puppet_env, assets, acc_before=-5000.0, acc=-2000.0)
+    np.testing.assert_allclose(found, 1.0 - 5e-6 * 29 * 2000.0, atol=1e-5)  # 0.71
+
+
+def test_the_action_rate_is_against_the_action_of_the_step_before(puppet_env, assets):
+    found = regularisation(puppet_env, assets, action=-0.25, last_action=0.5)
+    np.testing.assert_allclose(found, 1.0 - 0.1 * 29 * 0.75, atol=1e-5)  # −1.175
+
+
+def test_the_torque_that_costs_is_that_towards_the_pd_target(puppet_env, assets):
+    """On the reference at rest, an action of 3.8 is 3.8 · 0.25 = 0.95 of each motor's limit: 0.05 above 0.9."""
+    found = regularisation(puppet_env, assets, action=3.8, last_action=3.8)
+    np.testing.assert_allclose(found, 1.0 - 0.1 * 29 * 0.05, atol=1e-4)  # 0.855
 
 
 def test_a_clips_end_is_a_truncation_at_its_last_frame(puppet_env, assets):
@@ -188,21 +244,112 @@ def test_no_wrench_where_its_gain_is_off(puppet_env, assets):
     assert not np.asarray(puppet_env.engine.wrench).any()
 
 
-def test_the_wrench_is_the_episodes_gain_times_the_reference_wrench(robot, puppet_env, assets):
-    env = with_config(puppet_env, wrench=dataclasses.replace(puppet_env.config.wrench, max_gain=0.6))
-    gain = jnp.array([0.0, 0.2, 0.4, 0.6])
-    state = dataclasses.replace(start(env, assets, [0] * ENVS, [3] * ENVS), wrench_gain=gain)
-    with jax.disable_jit():  # the physics steps of a control step are a scan, which would hide what each is told
-        follow(env, assets, state)
-    assert len(env.engine.wrenches) == env.config.physics.substeps
-    # On the reference the errors are zero: the force is M (a_ref − g) of the frame where the robot is.
-    acceleration = rows(assets.library, [0] * ENVS, [3] * ENVS, "anchor_lin_acc")
-    expected = np.asarray(gain)[:, None] * robot.model.body_mass.sum() * (acceleration - [0.0, 0.0, -9.81])
-    np.testing.assert_allclose(env.engine.wrenches[0][:, :3], expected, rtol=1e-4, atol=1e-2)
-    # The next physics step's is of where the first one left the robot, a frame ahead.
-    ahead = np.asarray(env.engine.wrenches[1] - env.engine.wrenches[0])
-    assert (np.abs(ahead[1:, :3]).max(axis=1) > 1.0).all()
-    assert not ahead[0].any()
+def wrench_env(puppet_env: Environment) -> Environment:
+    return with_config(puppet_env, wrench=dataclasses.replace(puppet_env.config.wrench, max_gain=0.6))
+
+
+def anchor_track(env: Environment, library, clip: list[int], frame: list[int]) -> list[dict[str, np.ndarray]]:
+    """The library's anchor at the start of each physics step of a control step, by NumPy and SciPy."""
+    anchor, substeps = env.robot.anchor, env.config.physics.substeps
+    ends = np.array([frame, np.array(frame) + 1])
+    bodies = ("body_pos", "body_lin_vel", "body_ang_vel")
+    both = {name: np.asarray(getattr(library, name), np.float64)[clip, ends][:, :, anchor] for name in bodies}
+    for name in ("anchor_lin_acc", "anchor_ang_acc"):
+        both[name] = np.asarray(getattr(library, name), np.float64)[clip, ends]
+    quat = np.asarray(library.body_quat, np.float64)[clip, ends][:, :, anchor]
+    track = []
+    for part in np.arange(substeps) / substeps:
+        now = {name: (1.0 - part) * values[0] + part * values[1] for name, values in both.items()}
+        now["body_quat"] = np.stack(
+            [
+                Slerp([0.0, 1.0], Rotation.from_quat(pair, scalar_first=True))(part).as_quat(scalar_first=True)
+                for pair in quat.swapaxes(0, 1)
+            ]
+        )
+        track.append(now)
+    return track
+
+
+def carried(env: Environment, assets, state: EnvState, track: list[dict[str, np.ndarray]]) -> list[np.ndarray]:
+    """The wrench [env, 6] of every physics step of a robot whose anchor goes along `track`."""
+    env.engine.route = [
+        dataclasses.replace(
+            state.bodies,
+            **{
+                name: getattr(state.bodies, name).at[:, env.robot.anchor].set(jnp.asarray(now[f"body_{name}"]))
+                for name in ("pos", "quat", "lin_vel", "ang_vel")
+            },
+        )
+        for now in track
+    ]
+    state = dataclasses.replace(state, bodies=env.engine.route.pop(0))
+    env.engine.next_bodies = state.bodies  # after the last physics step; no wrench follows it
+    with jax.disable_jit():  # the physics steps of a control step are a scan, which would hide what each is given
+        tracking.step(env, assets, state, jnp.zeros((ENVS, 29)), KEY)
+    return [np.asarray(wrench) for wrench in env.engine.wrenches]
+
+
+@pytest.fixture(scope="module")
+def shipped(robot, tiny_config):
+    return make_assets(Setup(tiny_config, robot, load_library(robot, clips=["run", "backflip"]), ""))
+
+
+def test_a_robot_on_the_reference_at_every_physics_step_feels_no_pull(robot, puppet_env, shipped):
+    """The run and the backflip, between frames too: F = M (a_ref − g), τ = I_w α_ref + ω × I_w ω."""
+    env = wrench_env(puppet_env)
+    clip, frame = [0, 0, 1, 1], [10, 25, 30, 45]
+    gain = np.array([0.6, 0.2, 0.4, 0.6])
+    state = dataclasses.replace(start(env, shipped, clip, frame), wrench_gain=jnp.asarray(gain, jnp.float32))
+    track = anchor_track(env, shipped.library, clip, frame)
+    speeds = np.linalg.norm(rows(shipped.library, clip, frame, "body_lin_vel")[:, robot.anchor], axis=-1)
+    assert speeds.min() > 1.0  # m/s: 15 mm in the last three quarters of a control step
+    mass, inertia = robot.model.body_mass.sum(), np.asarray(robot.arrays.inertia, np.float64)
+    wrenches = carried(env, shipped, state, track)
+    assert len(wrenches) == env.config.physics.substeps == 4
+    for now, wrench in zip(track, wrenches, strict=True):
+        turn = Rotation.from_quat(now["body_quat"], scalar_first=True).as_matrix()
+        world_inertia = turn @ inertia @ turn.swapaxes(-1, -2)
+        spin = now["body_ang_vel"]
+        force = mass * (now["anchor_lin_acc"] - [0.0, 0.0, -9.81])
+        torque = np.einsum("eij,ej->ei", world_inertia, now["anchor_ang_acc"])
+        torque += np.cross(spin, np.einsum("eij,ej->ei", world_inertia, spin))
+        np.testing.assert_allclose(wrench[:, :3], gain[:, None] * force, rtol=1e-5, atol=0.02)
+        np.testing.assert_allclose(wrench[:, 3:], gain[:, None] * torque, rtol=1e-4, atol=0.02)
+
+
+def test_a_reference_of_constant_velocity_needs_the_weight_and_no_torque(robot, puppet_env, assets):
+    """3 m/s ahead while spinning at 2 rad/s about a principal axis: the wrench is β (0, 0, M g, 0, 0, 0) throughout."""
+    env, anchor = wrench_env(puppet_env), robot.anchor
+    velocity, spin = np.array([3.0, -1.0, 0.5]), np.array([0.0, 0.0, 2.0])
+
+    def at(time: np.ndarray) -> dict[str, np.ndarray]:
+        """The anchor [..., 3 or 4] at times in frames."""
+        seconds = 0.02 * np.asarray(time)[..., None]
+        return {
+            "body_pos": np.array([0.0, 0.0, 1.0]) + velocity * seconds,
+            "body_quat": Rotation.from_rotvec((spin * seconds).reshape(-1, 3))
+            .as_quat(scalar_first=True)
+            .reshape(*seconds.shape[:-1], 4),
+            "body_lin_vel": np.broadcast_to(velocity, (*seconds.shape[:-1], 3)),
+            "body_ang_vel": np.broadcast_to(spin, (*seconds.shape[:-1], 3)),
+        }
+
+    library = assets.library
+    frames = np.broadcast_to(np.arange(library.joint_pos.shape[1]), library.joint_pos.shape[:2])
+    moved = {name: getattr(library, name).at[:, :, anchor].set(values) for name, values in at(frames).items()}
+    still = {name: jnp.zeros_like(getattr(library, name)) for name in ("anchor_lin_acc", "anchor_ang_acc")}
+    inertia = jnp.diag(jnp.array([1.0, 2.0, 3.0]))
+    assets = dataclasses.replace(
+        assets,
+        library=dataclasses.replace(library, **moved, **still),
+        robot=dataclasses.replace(assets.robot, inertia=inertia),
+    )
+    frame = np.array([0, 3, 10, 20])
+    state = start(env, assets, [0] * ENVS, list(frame), gain=0.5)
+    wrenches = carried(env, assets, state, [at(frame + part) for part in (0.0, 0.25, 0.5, 0.75)])
+    expected = [0.0, 0.0, 0.5 * robot.model.body_mass.sum() * 9.81, 0.0, 0.0, 0.0]
+    for wrench in wrenches:
+        np.testing.assert_allclose(wrench, np.tile(expected, (ENVS, 1)), rtol=1e-5, atol=0.02)
 
 
 def test_the_wrench_carries_the_robot_and_does_not_tear_it_apart(robot, tiny_config, library):

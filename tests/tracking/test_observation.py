@@ -142,18 +142,18 @@ def test_noise_is_uniform_in_its_half_width(part):
 
 
 def critic_of(robot, reference: Reference, bodies: BodyState, **changes) -> np.ndarray:
-    arguments = dict(wrench=jnp.zeros((1, 6)), wrench_gain=jnp.zeros(1), phase=jnp.zeros(1), terms=jnp.ones((1, 9)))
+    arguments = dict(wrench=jnp.zeros((1, 6)), wrench_gain=jnp.zeros(1), phase=jnp.zeros(1), terms=jnp.ones((1, 10)))
     clean = jnp.zeros((1, 132))
     return np.asarray(critic_observation(clean, reference, bodies, robot.anchor, robot.root, **arguments | changes))[0]
 
 
 # After the actor's 132: 3 + 6 anchor error, 14 bodies × (3 + 6 + 3 + 3) of reference and robot, 3 base velocity,
-# 6 wrench, gain, phase, 9 terms, 14 × 3 contact forces.
+# 6 wrench, gain, phase, 10 terms, 14 × 3 contact forces.
 ANCHOR, REFERENCE, ROBOT, BASE = slice(132, 141), slice(141, 351), slice(351, 561), slice(561, 564)
-WRENCH, GAIN, PHASE, TERMS, CONTACT = slice(564, 570), 570, 571, slice(572, 581), slice(581, 623)
+WRENCH, GAIN, PHASE, TERMS, CONTACT = slice(564, 570), 570, 571, slice(572, 582), slice(582, 624)
 
 
-def test_the_critic_sees_623_numbers_on_the_g1(robot, library):
+def test_the_critic_sees_624_numbers_on_the_g1(robot, library):
     reference = lookup(library, jnp.array([0]), jnp.array([5]))
     assert critic_of(robot, reference, on_reference(reference)).size == CONTACT.stop
 
@@ -201,13 +201,13 @@ def test_the_critics_other_features_stand_where_they_belong(robot, library):
     reference = lookup(library, jnp.array([0]), jnp.array([5]))
     force = jnp.zeros((1, 14, 3)).at[0, 3].set(jnp.array([np.e - 1.0, -(np.e**2 - 1.0), 0.0]))
     bodies = dataclasses.replace(on_reference(reference), contact_force=force)
-    wrench, terms = jnp.arange(6.0)[None], jnp.linspace(0.1, 0.9, 9)[None]
+    wrench, terms = jnp.arange(6.0)[None], jnp.linspace(0.1, 1.0, 10)[None]
     critic = critic_of(
         robot, reference, bodies, wrench=wrench, wrench_gain=jnp.array([0.3]), phase=jnp.array([0.7]), terms=terms
     )
     np.testing.assert_allclose(critic[WRENCH], np.arange(6.0))
     np.testing.assert_allclose(critic[[GAIN, PHASE]], [0.3, 0.7], rtol=1e-6)
-    np.testing.assert_allclose(critic[TERMS], np.linspace(0.1, 0.9, 9), rtol=1e-5)
+    np.testing.assert_allclose(critic[TERMS], np.linspace(0.1, 1.0, 10), rtol=1e-5)
     contact = critic[CONTACT].reshape(14, 3)
     np.testing.assert_allclose(contact[3], [1.0, -2.0, 0.0], rtol=1e-5)
     assert not np.delete(contact, 3, axis=0).any()

@@ -11,9 +11,11 @@ from scipy.spatial.transform import Rotation
 from forgetmimic_jax.settings.config import RewardConfig
 from forgetmimic_jax.tracking.reference import align_to_anchor, lookup
 from forgetmimic_jax.tracking.reward import (
+    TERMS,
+    Pair,
     regularisation_reward,
     total_tracking_weight,
-    tracking_errors,
+    tracking_kernels,
     tracking_reward,
     tracking_weights,
 )
@@ -30,7 +32,6 @@ PAPER_WEIGHTS = {
     "body_angular_velocity": 0.5,
     "joint_position": 1.0,
 }
-BODY_TERMS = [name for name in PAPER_WEIGHTS if name.startswith("body")]
 ROOT_TERMS = [name for name in PAPER_WEIGHTS if name.startswith("root")]
 QUARTER = np.exp(-0.25)  # a kernel with κ = 1/4 whose error is exactly σ
 WITH_JOINT_VELOCITY = RewardConfig(joint_velocity=1.0)
@@ -39,13 +40,14 @@ WITH_JOINT_VELOCITY = RewardConfig(joint_velocity=1.0)
 @partial(jax.jit, static_argnums=(0, 1))
 def compiled_reward(config, anchor, reference, bodies, joint_pos, joint_vel):
     aligned = align_to_anchor(reference, anchor, bodies.pos[:, anchor], bodies.quat[:, anchor])
-    return tracking_reward(tracking_errors(reference, aligned, bodies, anchor, joint_pos, joint_vel), config)
+    kernels = tracking_kernels(Pair(reference, aligned, bodies, anchor, joint_pos, joint_vel))
+    return *tracking_reward(kernels, config), kernels
 
 
 def terms_of(robot, reference, bodies, joint_pos=None, joint_vel=None) -> dict[str, np.ndarray]:
     joint_pos = reference.joint_pos if joint_pos is None else joint_pos
     joint_vel = reference.joint_vel if joint_vel is None else joint_vel
-    terms = compiled_reward(WITH_JOINT_VELOCITY, robot.anchor, reference, bodies, joint_pos, joint_vel)[2]
+    terms = compiled_reward(RewardConfig(), robot.anchor, reference, bodies, joint_pos, joint_vel)[2]
     return {name: np.asarray(value) for name, value in terms.items()}
 
 
@@ -54,8 +56,9 @@ def test_weights_are_the_papers_and_sum_to_eight():
     assert total_tracking_weight(RewardConfig()) == sum(PAPER_WEIGHTS.values()) == 8.0
 
 
-def test_a_weight_of_zero_leaves_both_sum_and_mean():
-    assert "joint_velocity" not in tracking_weights(RewardConfig())
+def test_every_term_has_a_weight_in_the_settings_and_zero_leaves_the_sum():
+    assert {term.name for term in TERMS} == {*PAPER_WEIGHTS, "joint_velocity"}
+    assert {term.name for term in TERMS} <= {field.name for field in dataclasses.fields(RewardConfig)}
     assert total_tracking_weight(WITH_JOINT_VELOCITY) == 9.0
 
 
@@ -135,13 +138,13 @@ def test_sigma_per_joint_is_sigma_root_n_on_the_summed_error(robot):
     np.testing.assert_allclose(terms["joint_position"], np.exp(-0.25 * (offsets @ offsets) / (0.09 * 29)), rtol=1e-4)
 
 
-def test_body_terms_do_not_see_where_the_robot_stands_nor_its_heading(robot, library):
+def test_body_poses_do_not_see_where_the_robot_stands_nor_its_heading(robot, library):
     reference = lookup(library, jnp.array([1]), jnp.array([25]))
     bodies = shaken(on_reference(reference), seed=3)
     here = terms_of(robot, reference, bodies)
     for yaw, shift in [(0.7, (2.0, -1.0)), (-2.5, (0.0, 0.3)), (3.1, (-5.0, 5.0))]:
         there = terms_of(robot, reference, turned(bodies, yaw, shift))
-        for name in [*BODY_TERMS, "joint_position"]:
+        for name in ("body_position", "body_orientation", "joint_position"):
             np.testing.assert_allclose(there[name], here[name], atol=2e-5, err_msg=name)
 
 
@@ -161,6 +164,23 @@ def test_root_velocity_is_compared_in_the_world(robot, library):
     np.testing.assert_allclose(terms_of(robot, reference, bodies)["root_linear_velocity"], expected, rtol=1e-4)
 
 
+def test_a_heading_error_of_half_a_rad_costs_in_the_body_velocities(robot):
+    """wbc-mjlab compares them in the world. A turn by θ moves a horizontal v by 2 v sin(θ/2): 0.9896 m/s of 2 m/s, and
+    1.4844 rad/s of 3 rad/s. Kernels with κ = 1: exp(−0.9896²) = 0.3756 and exp(−(1.4844 / 3.14)²) = 0.7997."""
+    reference, _ = upright_scene(robot)
+    reference = dataclasses.replace(
+        reference,
+        body_lin_vel=reference.body_lin_vel + jnp.array([2.0, 0.0, 0.0]),
+        body_ang_vel=reference.body_ang_vel + jnp.array([0.0, 3.0, 0.0]),
+    )
+    straight = terms_of(robot, reference, on_reference(reference))
+    astray = terms_of(robot, reference, turned(on_reference(reference), 0.5, (0.0, 0.0)))
+    by_hand = {"body_linear_velocity": 0.3756, "body_angular_velocity": 0.7997}
+    for name, value in by_hand.items():
+        np.testing.assert_allclose(straight[name], 1.0, atol=1e-6)
+        np.testing.assert_allclose(astray[name], value, atol=1e-4)
+
+
 def test_height_is_not_aligned_away(robot):
     reference, bodies = upright_scene(robot)
     lower = dataclasses.replace(bodies, pos=bodies.pos - jnp.array([0.0, 0.0, 0.3]))
@@ -168,12 +188,18 @@ def test_height_is_not_aligned_away(robot):
 
 
 def test_tracking_reward_is_the_weighted_sum_and_its_mean_lies_in_the_unit_interval():
-    errors = {name: jnp.array([0.3, 1e9]) for name in [*PAPER_WEIGHTS, "joint_velocity"]}
-    total, normalized, terms = tracking_reward(errors, RewardConfig())
-    by_hand = sum(weight * np.asarray(terms[name]) for name, weight in PAPER_WEIGHTS.items())
-    np.testing.assert_allclose(total, by_hand, rtol=1e-6)
-    np.testing.assert_allclose(normalized, by_hand / 8.0, rtol=1e-6)
-    assert float(normalized[1]) == 0.0
+    kernels = {term.name: jnp.array([0.5, 1.0, 0.0]) for term in TERMS} | {
+        "body_linear_velocity": jnp.array([0.1, 1, 0])
+    }
+    total, normalized = tracking_reward(kernels, RewardConfig())
+    np.testing.assert_allclose(total, [7.5 * 0.5 + 0.5 * 0.1, 8.0, 0.0], rtol=1e-6)
+    np.testing.assert_allclose(normalized, [3.8 / 8.0, 1.0, 0.0], rtol=1e-6)
+
+
+def test_a_term_of_weight_zero_has_a_kernel_but_no_part_in_the_reward():
+    kernels = {term.name: jnp.ones(1) for term in TERMS} | {"joint_velocity": jnp.zeros(1)}
+    assert [float(value[0]) for value in tracking_reward(kernels, RewardConfig())] == [8.0, 1.0]
+    assert [float(value[0]) for value in tracking_reward(kernels, WITH_JOINT_VELOCITY)] == [8.0, pytest.approx(8 / 9)]
 
 
 def regularisation(robot, config=RewardConfig(), **changes) -> float:  # noqa: B008 (a frozen dataclass)
