@@ -15,10 +15,11 @@ from jax import Array
 from forgetmimic_jax.basics import rotation
 from forgetmimic_jax.evaluation.metrics import Rollout
 from forgetmimic_jax.policy.policy import Policy
+from forgetmimic_jax.robot.model import Robot
 from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking import env as tracking
-from forgetmimic_jax.tracking.env import Assets, Environment, EnvState, StepResult
-from forgetmimic_jax.tracking.reference import align_to_anchor
+from forgetmimic_jax.tracking.env import Assets, Environment, EnvState
+from forgetmimic_jax.tracking.reward import Pair
 from forgetmimic_jax.tracking.setup import Setup
 
 CHUNK = 50  # control steps between two looks whether every episode has ended
@@ -88,7 +89,7 @@ class Evaluator:
         def one_step(state: EnvState, key: Array):
             action = act(env, policy, tracking.observe(env, assets, state, None)[0])
             state, result = tracking.step(env, assets, state, action, key)
-            record = step_errors(env, assets, state, result)
+            record = step_errors(env.robot, result.pair)
             record |= {
                 "tracking_reward": result.reward.normalized_tracking,
                 "terminated": result.terminated,
@@ -142,7 +143,7 @@ def episode_starts(lengths: np.ndarray, episodes: int, seed: int) -> tuple[np.nd
     return np.repeat(np.arange(len(lengths)), episodes), np.concatenate(starts)
 
 
-def step_errors(env: Environment, assets: Assets, state: EnvState, result: StepResult) -> dict[str, Array]:
+def step_errors(robot: Robot, pair: Pair) -> dict[str, Array]:
     """The field's standard tracking errors and the paper's physical measures after a step, each [env].
 
     mpkpe and root_relative_mpkpe in m (the second after moving the reference to the robot's anchor),
@@ -150,14 +151,12 @@ def step_errors(env: Environment, assets: Assets, state: EnvState, result: StepR
     in m (re-anchored), anchor errors in m and rad, max_key_body_position_error in m (re-anchored), the share of feet
     in contact, and the share of joints beyond their soft limits.
     """
-    robot, bodies, reference = env.robot, state.bodies, result.reference
-    anchor = robot.anchor
-    aligned = align_to_anchor(reference, anchor, bodies.pos[:, anchor], bodies.quat[:, anchor])
-    joint_pos, joint_vel = state.physics.qpos[:, 7:], state.physics.qvel[:, 6:]
-    world = jnp.linalg.norm(reference.body_pos - bodies.pos, axis=-1)
+    bodies, reference, aligned, anchor = pair.bodies, pair.reference, pair.aligned, pair.anchor
+    joint_pos, joint_vel = pair.joint_pos, pair.joint_vel
+    world = jnp.linalg.norm(reference.bodies.pos - bodies.pos, axis=-1)
     relative = jnp.linalg.norm(aligned.pos - bodies.pos, axis=-1)
     feet = jnp.linalg.norm(bodies.contact_force[:, robot.feet], axis=-1)
-    outside = (joint_pos < assets.robot.soft_lower) | (joint_pos > assets.robot.soft_upper)
+    outside = (joint_pos < robot.arrays.soft_lower) | (joint_pos > robot.arrays.soft_upper)
     return {
         "mpkpe": world.mean(-1),
         "root_relative_mpkpe": relative.mean(-1),
@@ -165,7 +164,7 @@ def step_errors(env: Environment, assets: Assets, state: EnvState, result: StepR
         "joint_velocity_error": jnp.sqrt(((reference.joint_vel - joint_vel) ** 2).mean(-1)),
         "end_effector_error": relative[:, robot.end_effectors].mean(-1),
         "anchor_position_error": world[:, anchor],
-        "anchor_orientation_error": rotation.angle_between(reference.body_quat[:, anchor], bodies.quat[:, anchor]),
+        "anchor_orientation_error": rotation.angle_between(reference.bodies.quat[:, anchor], bodies.quat[:, anchor]),
         "max_key_body_position_error": relative.max(-1),
         "foot_contact": (feet > CONTACT_FORCE).mean(-1),
         "joint_limit_violation": outside.mean(-1),

@@ -10,13 +10,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
 from forgetmimic_jax.evaluation.metrics import Rollout
 from forgetmimic_jax.exchange.onnx_actor import OnnxActor
-from forgetmimic_jax.motion.library import MotionLibrary
+from forgetmimic_jax.motion.library import Frames, MotionLibrary
 from forgetmimic_jax.physics import BodyState
 from forgetmimic_jax.physics.engine import contact_sensor_columns
 from forgetmimic_jax.robot.model import Robot
@@ -27,7 +28,6 @@ from forgetmimic_jax.tracking.reference import align_to_anchor, lookup
 from forgetmimic_jax.tracking.termination import terminations
 
 DOWN = np.array([0.0, 0.0, -1.0])
-_REFERENCE = ("joint_pos", "body_pos", "body_quat", "body_lin_vel", "body_ang_vel")
 _BODIES = ("pos", "quat", "lin_vel", "ang_vel", "contact_force")
 
 
@@ -59,13 +59,13 @@ def run_episodes(
         start: the episodes (`Evaluator.start`).
         report: called after each episode with the number of episodes and control steps done.
     """
-    reference = {name: np.asarray(getattr(library, name), np.float64) for name in _REFERENCE}
+    reference = jax.tree.map(lambda values: np.asarray(values, np.float64), library.frames)
     clips, frames, horizons = (np.asarray(x) for x in (start.clip, start.frame, start.horizon))
     episodes: list[dict[str, np.ndarray]] = []
     for clip, frame, horizon, qpos, qvel in zip(
         clips, frames, horizons, np.asarray(start.physics.qpos), np.asarray(start.physics.qvel), strict=True
     ):
-        ahead = {name: values[clip, frame + 1 : frame + 1 + horizon] for name, values in reference.items()}
+        ahead = jax.tree.map(lambda values: values[clip, frame + 1 : frame + 1 + horizon], reference)  # noqa: B023
         episodes.append(_run_episode(actor, robot, ahead, config.physics.substeps, qpos, qvel))
         report(len(episodes), sum(len(episode["action"]) for episode in episodes))
     steps = {name: np.concatenate([episode[name] for episode in episodes]) for name in episodes[0]}
@@ -85,7 +85,7 @@ def run_episodes(
 
 
 def _run_episode(
-    actor: OnnxActor, robot: Robot, reference: dict[str, np.ndarray], substeps: int, qpos: np.ndarray, qvel: np.ndarray
+    actor: OnnxActor, robot: Robot, reference: Frames, substeps: int, qpos: np.ndarray, qvel: np.ndarray
 ) -> dict[str, np.ndarray]:
     """The states [step, ...] that the policy leads the robot through, and what it saw and did."""
     model, data = robot.model, mujoco.MjData(robot.model)
@@ -94,11 +94,11 @@ def _run_episode(
     forces = contact_sensor_columns(robot)
     action = np.zeros(robot.num_joints, np.float32)
     steps = []
-    for i in range(len(reference["joint_pos"])):
-        frame = {name: values[i] for name, values in reference.items()}
+    for i in range(len(reference.joint_pos)):
+        frame = jax.tree.map(lambda values: values[i], reference)  # noqa: B023
         observation = _observe(data, frame, robot.root, default, action)
         action = actor(observation)
-        data.ctrl[:] = frame["joint_pos"] + scale * action
+        data.ctrl[:] = frame.joint_pos + scale * action
         mujoco.mj_step(model, data, substeps)
         force = -data.sensordata[forces]
         mujoco.mj_fwdPosition(model, data)  # the bodies, where the last substep left the joints
@@ -123,17 +123,17 @@ def _run_episode(
 
 
 def _observe(
-    data: mujoco.MjData, reference: dict[str, np.ndarray], root: int, default: np.ndarray, last_action: np.ndarray
+    data: mujoco.MjData, reference: Frames, root: int, default: np.ndarray, last_action: np.ndarray
 ) -> np.ndarray:
     """The actor's observation f32[features] from the robot's sensors and the frame to reach next."""
-    ref_quat = reference["body_quat"][root]
+    ref_quat = reference.bodies.quat[root]
     return np.concatenate(
         [
-            reference["body_pos"][root, 2:],
-            _in_frame(ref_quat, reference["body_lin_vel"][root]),
-            _in_frame(ref_quat, reference["body_ang_vel"][root]),
+            reference.bodies.pos[root, 2:],
+            _in_frame(ref_quat, reference.bodies.lin_vel[root]),
+            _in_frame(ref_quat, reference.bodies.ang_vel[root]),
             _in_frame(ref_quat, DOWN),
-            reference["joint_pos"],
+            reference.joint_pos,
             data.qvel[3:6],
             _in_frame(data.qpos[3:7], DOWN),
             data.qpos[7:] - default,
@@ -174,7 +174,7 @@ def _judge(
     anchor = robot.anchor
     aligned = align_to_anchor(reference, anchor, bodies.pos[:, anchor], bodies.quat[:, anchor])
     joint_pos, joint_vel = jnp.asarray(steps["qpos"][:, 7:]), jnp.asarray(steps["qvel"][:, 6:])
-    kernels = reward.tracking_kernels(reward.Pair(reference, aligned, bodies, anchor, joint_pos, joint_vel))
+    kernels = reward.tracking_kernels(reward.Pair(reference, aligned, bodies, joint_pos, joint_vel, anchor))
     causes = terminations(config.termination, reference, aligned, bodies, robot)
     normalized = reward.tracking_reward(kernels, config.reward)[1]
     return np.asarray(normalized), np.asarray(jnp.stack(list(causes.values())).any(0))

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from forgetmimic_jax.motion.clip import Clip, continuous
+from forgetmimic_jax.robot.bodies import Bodies
 from forgetmimic_jax.robot.model import Robot
 
 
@@ -120,15 +121,6 @@ def tile(clip: Clip, step: PlanarTransform, seconds: float) -> Clip:
     )
 
 
-class BodyMotion(NamedTuple):
-    """Poses and velocities of some bodies, world frame, at the bodies' origins."""
-
-    pos: np.ndarray  # [frame, body, 3] m
-    quat: np.ndarray  # [frame, body, 4] wxyz
-    lin_vel: np.ndarray  # [frame, body, 3] m/s
-    ang_vel: np.ndarray  # [frame, body, 3] rad/s
-
-
 def configuration(clip: Clip, robot: Robot) -> np.ndarray:
     """MuJoCo's qpos [frame, 7 + joint], joints matched by name."""
     order = [clip.joint_names.index(joint) for joint in robot.joint_names]
@@ -142,7 +134,7 @@ def generalized_velocity(qpos: np.ndarray, fps: float) -> np.ndarray:
     return np.concatenate([rate(qpos[:, :3], fps), local, rate(qpos[:, 7:], fps)], axis=-1)
 
 
-def body_motion(model: mujoco.MjModel, qpos: np.ndarray, fps: float, body_ids: np.ndarray) -> BodyMotion:
+def body_motion(model: mujoco.MjModel, qpos: np.ndarray, fps: float, body_ids: np.ndarray) -> Bodies:
     """Forward kinematics of a clip.
 
     Velocities follow from the differenced qpos through the Jacobian (mj_objectVelocity), so that a robot reset to
@@ -163,4 +155,4 @@ def body_motion(model: mujoco.MjModel, qpos: np.ndarray, fps: float, body_ids: n
         for row, body in enumerate(body_ids):
             mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, body, one, 0)
             velocity[frame, row] = one
-    return BodyMotion(pos, quat, velocity[..., 3:], velocity[..., :3])
+    return Bodies(pos, quat, velocity[..., 3:], velocity[..., :3])

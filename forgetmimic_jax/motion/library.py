@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -21,6 +22,7 @@ from forgetmimic_jax.basics.errors import InputError, nearest
 from forgetmimic_jax.basics.files import write_atomically
 from forgetmimic_jax.motion.clip import Clip, read_clip, write_clip
 from forgetmimic_jax.motion.kinematics import body_motion, configuration, rate, resample
+from forgetmimic_jax.robot.bodies import Bodies, Values
 from forgetmimic_jax.robot.model import Robot
 
 DATA_DIR = Path(__file__).resolve().parents[2] / "data"
@@ -31,21 +33,25 @@ MAX_ANGULAR_ACCELERATION = 100.0  # rad/s^2
 
 
 @struct.dataclass
+class Frames:
+    """Frames of reference motion. Leading dimensions are free: [frame], [clip, frame] or [env]."""
+
+    joint_pos: Values  # [..., joint] rad
+    joint_vel: Values  # [..., joint] rad/s
+    bodies: Bodies  # [..., key_body]
+    anchor_lin_acc: Values  # [..., 3] m/s², norm at most 50
+    anchor_ang_acc: Values  # [..., 3] rad/s², norm at most 100
+
+
+@struct.dataclass
 class MotionLibrary:
-    """Reference motions of one robot; K key bodies, world frame, velocities at the bodies' origins.
+    """Reference motions of one robot.
 
     Frames past a clip's end repeat its last frame.
     """
 
+    frames: Frames  # [clip, frame]
     length: Array  # i32[clip] frames of each clip
-    joint_pos: Array  # f32[clip, frame, joint] rad
-    joint_vel: Array  # f32[clip, frame, joint] rad/s
-    body_pos: Array  # f32[clip, frame, K, 3] m
-    body_quat: Array  # f32[clip, frame, K, 4] wxyz
-    body_lin_vel: Array  # f32[clip, frame, K, 3] m/s
-    body_ang_vel: Array  # f32[clip, frame, K, 3] rad/s
-    anchor_lin_acc: Array  # f32[clip, frame, 3] m/s^2, norm at most 50
-    anchor_ang_acc: Array  # f32[clip, frame, 3] rad/s^2, norm at most 100
     names: tuple[str, ...] = struct.field(pytree_node=False)
 
 
@@ -60,20 +66,18 @@ def build_library(robot: Robot, clips: Sequence[Clip], fps: float = 50.0) -> Mot
     rows = []
     for clip in clips:
         _check_joints(clip, robot)
-        rows.append(_arrays(robot, clip if clip.fps == fps else resample(clip, fps)))
-    longest = max(len(row["joint_pos"]) for row in rows)
+        rows.append(_frames(robot, clip if clip.fps == fps else resample(clip, fps)))
+    lengths = [len(row.joint_pos) for row in rows]
 
-    def padded(field: str) -> Array:
-        stacked = [
-            np.pad(row[field], [(0, longest - len(row[field]))] + [(0, 0)] * (row[field].ndim - 1), mode="edge")
-            for row in rows
-        ]
+    def padded(*values: np.ndarray) -> Array:
+        missing = [[(0, max(lengths) - len(value))] + [(0, 0)] * (value.ndim - 1) for value in values]
+        stacked = [np.pad(value, width, mode="edge") for value, width in zip(values, missing, strict=True)]
         return jnp.asarray(np.stack(stacked), jnp.float32)
 
     return MotionLibrary(
-        length=jnp.asarray([len(row["joint_pos"]) for row in rows], jnp.int32),
+        frames=jax.tree.map(padded, *rows),
+        length=jnp.asarray(lengths, jnp.int32),
         names=tuple(clip.name for clip in clips),
-        **{field: padded(field) for field in rows[0]},
     )
 
 
@@ -208,19 +212,17 @@ def _check_joints(clip: Clip, robot: Robot, source: str | None = None) -> None:
         )
 
 
-def _arrays(robot: Robot, clip: Clip) -> dict[str, np.ndarray]:
+def _frames(robot: Robot, clip: Clip) -> Frames:
+    """A clip's frames [frame], as numpy arrays."""
     qpos = configuration(clip, robot)
     bodies = body_motion(robot.model, qpos, clip.fps, robot.key_body_ids)
-    return {
-        "joint_pos": qpos[:, 7:],
-        "joint_vel": rate(qpos[:, 7:], clip.fps),
-        "body_pos": bodies.pos,
-        "body_quat": bodies.quat,
-        "body_lin_vel": bodies.lin_vel,
-        "body_ang_vel": bodies.ang_vel,
-        "anchor_lin_acc": _clipped(rate(bodies.lin_vel[:, robot.anchor], clip.fps), MAX_LINEAR_ACCELERATION),
-        "anchor_ang_acc": _clipped(rate(bodies.ang_vel[:, robot.anchor], clip.fps), MAX_ANGULAR_ACCELERATION),
-    }
+    return Frames(
+        joint_pos=qpos[:, 7:],
+        joint_vel=rate(qpos[:, 7:], clip.fps),
+        bodies=bodies,
+        anchor_lin_acc=_clipped(rate(bodies.lin_vel[:, robot.anchor], clip.fps), MAX_LINEAR_ACCELERATION),
+        anchor_ang_acc=_clipped(rate(bodies.ang_vel[:, robot.anchor], clip.fps), MAX_ANGULAR_ACCELERATION),
+    )
 
 
 def _clipped(vectors: np.ndarray, limit: float) -> np.ndarray:

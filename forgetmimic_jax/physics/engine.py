@@ -14,6 +14,7 @@ from flax import struct
 from jax import Array
 
 from forgetmimic_jax.basics import rotation
+from forgetmimic_jax.robot.bodies import Bodies
 from forgetmimic_jax.robot.model import CONTACT_SENSOR, Robot
 from forgetmimic_jax.settings.config import PhysicsConfig
 
@@ -36,13 +37,9 @@ class PhysicsParameters:
 
 
 @struct.dataclass
-class BodyState:
-    """Key bodies in the world frame; velocities at the body's origin."""
+class BodyState(Bodies):
+    """Key bodies [env, key_body, ...] of the simulated robots, and what they touch."""
 
-    pos: Array  # [env, key_body, 3] m
-    quat: Array  # [env, key_body, 4] wxyz
-    lin_vel: Array  # [env, key_body, 3] m/s
-    ang_vel: Array  # [env, key_body, 3] rad/s
     contact_force: Array  # [env, key_body, 3] N of the floor on the body, world frame, during the last physics step
 
 

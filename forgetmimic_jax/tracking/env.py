@@ -21,7 +21,8 @@ from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.robot.model import Robot, RobotArrays
 from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking import observation, randomise, reward
-from forgetmimic_jax.tracking.reference import Reference, align_to_anchor, anchor_between, lookup
+from forgetmimic_jax.tracking.reference import align_to_anchor, anchor_between, lookup
+from forgetmimic_jax.tracking.reward import Pair
 from forgetmimic_jax.tracking.rsi import Bins, make_bins, sample_start
 from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.tracking.termination import terminations
@@ -68,7 +69,7 @@ class StepResult:
     truncated: Array  # bool: the clip or the time ended
     diverged: Array  # bool: NaN, Inf or absurd numbers in the physics
     causes: dict[str, Array]  # bool, which bound
-    reference: Reference  # the frame that was tracked
+    pair: Pair  # the robot beside the frame that it tracked
 
 
 @dataclass(frozen=True)
@@ -124,13 +125,7 @@ def start_episodes(
         encoder_bias = jnp.zeros((n, joints))
     return EnvState(
         physics=randomise.reset_state(noise, assets.robot, reference, env.robot.root, keys[0]),
-        bodies=BodyState(
-            pos=reference.body_pos,
-            quat=reference.body_quat,
-            lin_vel=reference.body_lin_vel,
-            ang_vel=reference.body_ang_vel,
-            contact_force=jnp.zeros_like(reference.body_pos),
-        ),
+        bodies=BodyState(**vars(reference.bodies), contact_force=jnp.zeros_like(reference.bodies.pos)),
         parameters=parameters,
         clip=clip,
         frame=frame,
@@ -203,7 +198,8 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
 
     joint_pos, joint_vel = physics.qpos[:, 7:], physics.qvel[:, 6:]
     aligned = align_to_anchor(reference, robot.anchor, bodies.pos[:, robot.anchor], bodies.quat[:, robot.anchor])
-    kernels = reward.tracking_kernels(reward.Pair(reference, aligned, bodies, robot.anchor, joint_pos, joint_vel))
+    pair = Pair(reference, aligned, bodies, joint_pos, joint_vel, robot.anchor)
+    kernels = reward.tracking_kernels(pair)
     tracking, normalized = reward.tracking_reward(kernels, config.reward)
     regularisation = reward.regularisation_reward(
         assets.robot,
@@ -235,7 +231,7 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
         terms=jnp.stack([result_reward.terms[term.name] for term in reward.TERMS], axis=-1),
     )
     truncated = (steps >= state.horizon) & ~terminated
-    return new, StepResult(result_reward, terminated, truncated, diverged, causes, reference)
+    return new, StepResult(result_reward, terminated, truncated, diverged, causes, pair)
 
 
 def _live(env: Environment, assets: Assets, state: EnvState, target: Array) -> tuple[PhysicsState, BodyState]:

@@ -10,11 +10,12 @@ import jax.numpy as jnp
 from jax import Array
 
 from forgetmimic_jax.basics import rotation
+from forgetmimic_jax.motion.library import Frames
 from forgetmimic_jax.physics import BodyState, PhysicsState
+from forgetmimic_jax.robot.bodies import Bodies
 from forgetmimic_jax.robot.model import RobotArrays
 from forgetmimic_jax.settings.config import NoiseConfig
 from forgetmimic_jax.tracking.randomise import symmetric
-from forgetmimic_jax.tracking.reference import Reference
 
 
 def actor_layout(num_joints: int) -> dict[str, int]:
@@ -39,7 +40,7 @@ def actor_size(num_joints: int) -> int:
 
 
 def actor_observation(
-    robot: RobotArrays, reference: Reference, root: int, physics: PhysicsState, last_action: Array
+    robot: RobotArrays, reference: Frames, root: int, physics: PhysicsState, last_action: Array
 ) -> Array:
     """[env, 16 + 4 joint], without noise or encoder bias.
 
@@ -50,14 +51,14 @@ def actor_observation(
         physics: the robot's state.
         last_action: [env, joint].
     """
-    ref_quat = reference.body_quat[:, root]
+    ref_quat = reference.bodies.quat[:, root]
     quat = physics.qpos[:, 3:7]
     down = jnp.zeros_like(physics.qpos[:, :3]).at[:, 2].set(-1.0)
     return jnp.concatenate(
         [
-            reference.body_pos[:, root, 2:],
-            rotation.rotate_inverse(ref_quat, reference.body_lin_vel[:, root]),
-            rotation.rotate_inverse(ref_quat, reference.body_ang_vel[:, root]),
+            reference.bodies.pos[:, root, 2:],
+            rotation.rotate_inverse(ref_quat, reference.bodies.lin_vel[:, root]),
+            rotation.rotate_inverse(ref_quat, reference.bodies.ang_vel[:, root]),
             rotation.rotate_inverse(ref_quat, down),
             reference.joint_pos,
             physics.qvel[:, 3:6],
@@ -92,7 +93,7 @@ def observation_noise(config: NoiseConfig, key: Array, num_envs: int, num_joints
 
 def critic_observation(
     clean_actor: Array,
-    reference: Reference,
+    reference: Frames,
     bodies: BodyState,
     anchor: int,
     root: int,
@@ -120,15 +121,15 @@ def critic_observation(
         terms: [env, term] kernels r_j of the last step, in the order of `reward.TERMS`.
     """
     pos, quat = bodies.pos[:, anchor], bodies.quat[:, anchor]
-    ref_pos, ref_quat = reference.body_pos[:, anchor], reference.body_quat[:, anchor]
+    ref_pos, ref_quat = reference.bodies.pos[:, anchor], reference.bodies.quat[:, anchor]
 
-    def in_frame(origin: Array, frame: Array, body_pos: Array, body_quat: Array, lin: Array, ang: Array) -> list[Array]:
+    def in_frame(origin: Array, frame: Array, of: Bodies) -> list[Array]:
         frame = frame[:, None]
         return [
-            rotation.rotate_inverse(frame, body_pos - origin[:, None]).reshape(len(pos), -1),
-            rotation.to_matrix_columns(rotation.multiply(rotation.conjugate(frame), body_quat)).reshape(len(pos), -1),
-            rotation.rotate_inverse(frame, lin).reshape(len(pos), -1),
-            rotation.rotate_inverse(frame, ang).reshape(len(pos), -1),
+            rotation.rotate_inverse(frame, of.pos - origin[:, None]).reshape(len(pos), -1),
+            rotation.to_matrix_columns(rotation.multiply(rotation.conjugate(frame), of.quat)).reshape(len(pos), -1),
+            rotation.rotate_inverse(frame, of.lin_vel).reshape(len(pos), -1),
+            rotation.rotate_inverse(frame, of.ang_vel).reshape(len(pos), -1),
         ]
 
     force = bodies.contact_force.reshape(len(pos), -1)
@@ -137,9 +138,8 @@ def critic_observation(
             clean_actor,
             rotation.rotate_inverse(quat, ref_pos - pos),
             rotation.to_matrix_columns(rotation.multiply(rotation.conjugate(quat), ref_quat)),
-            *in_frame(ref_pos, ref_quat, reference.body_pos, reference.body_quat, reference.body_lin_vel,
-                      reference.body_ang_vel),
-            *in_frame(pos, quat, bodies.pos, bodies.quat, bodies.lin_vel, bodies.ang_vel),
+            *in_frame(ref_pos, ref_quat, reference.bodies),
+            *in_frame(pos, quat, bodies),
             rotation.rotate_inverse(bodies.quat[:, root], bodies.lin_vel[:, root]),
             wrench,
             wrench_gain[:, None],
@@ -148,4 +148,4 @@ def critic_observation(
             jnp.sign(force) * jnp.log1p(jnp.abs(force)),
         ],
         axis=-1,
-    )  # fmt: skip
+    )

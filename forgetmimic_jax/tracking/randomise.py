@@ -7,10 +7,10 @@ import jax.numpy as jnp
 from jax import Array
 
 from forgetmimic_jax.basics import rotation
+from forgetmimic_jax.motion.library import Frames
 from forgetmimic_jax.physics import PhysicsParameters, PhysicsState
 from forgetmimic_jax.robot.model import RobotArrays
 from forgetmimic_jax.settings.config import NoiseConfig
-from forgetmimic_jax.tracking.reference import Reference
 
 
 def symmetric(key: Array, num_envs: int, half_width) -> Array:
@@ -19,15 +19,15 @@ def symmetric(key: Array, num_envs: int, half_width) -> Array:
     return half_width * jax.random.uniform(key, (num_envs, half_width.size), minval=-1.0, maxval=1.0)
 
 
-def reset_state(config: NoiseConfig, robot: RobotArrays, reference: Reference, root: int, key: Array) -> PhysicsState:
+def reset_state(config: NoiseConfig, robot: RobotArrays, reference: Frames, root: int, key: Array) -> PhysicsState:
     """The reference frame as a physics state, with reset noise; the noise keeps joints inside their soft limits."""
     num_envs, num_joints = reference.joint_pos.shape
     keys = jax.random.split(key, 5)
-    pos = reference.body_pos[:, root] + symmetric(keys[0], num_envs, config.reset_position)
+    pos = reference.bodies.pos[:, root] + symmetric(keys[0], num_envs, config.reset_position)
     turn = rotation.from_euler(symmetric(keys[1], num_envs, config.reset_orientation))
-    quat = rotation.multiply(turn, reference.body_quat[:, root])
-    lin_vel = reference.body_lin_vel[:, root] + symmetric(keys[2], num_envs, config.reset_linear_velocity)
-    ang_vel = reference.body_ang_vel[:, root] + symmetric(keys[3], num_envs, config.reset_angular_velocity)
+    quat = rotation.multiply(turn, reference.bodies.quat[:, root])
+    lin_vel = reference.bodies.lin_vel[:, root] + symmetric(keys[2], num_envs, config.reset_linear_velocity)
+    ang_vel = reference.bodies.ang_vel[:, root] + symmetric(keys[3], num_envs, config.reset_angular_velocity)
     joints = reference.joint_pos + symmetric(keys[4], num_envs, (config.reset_joint_position,) * num_joints)
     # A reference that is itself outside its soft limits keeps its own value.
     lower = jnp.minimum(robot.soft_lower, reference.joint_pos)

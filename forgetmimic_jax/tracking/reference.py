@@ -1,42 +1,20 @@
-"""The reference frame an environment tracks, and the reference moved to the robot's anchor."""
+"""The reference frame that an environment tracks, between two frames, and moved to the robot's anchor."""
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
 from forgetmimic_jax.basics import rotation
-from forgetmimic_jax.motion.library import MotionLibrary
+from forgetmimic_jax.motion.library import Frames, MotionLibrary
 
 
-@struct.dataclass
-class Reference:
-    """One frame of a clip for every environment; world frame."""
-
-    joint_pos: Array  # [env, joint] rad
-    joint_vel: Array  # [env, joint] rad/s
-    body_pos: Array  # [env, key_body, 3] m
-    body_quat: Array  # [env, key_body, 4]
-    body_lin_vel: Array  # [env, key_body, 3] m/s
-    body_ang_vel: Array  # [env, key_body, 3] rad/s
-    anchor_lin_acc: Array  # [env, 3] m/s²
-    anchor_ang_acc: Array  # [env, 3] rad/s²
-
-
-def lookup(library: MotionLibrary, clip: Array, frame: Array) -> Reference:
+def lookup(library: MotionLibrary, clip: Array, frame: Array) -> Frames:
     """Frame `frame` [env] of clip `clip` [env]; past a clip's end its last frame."""
     frame = jnp.minimum(frame, library.length[clip] - 1)
-    return Reference(
-        joint_pos=library.joint_pos[clip, frame],
-        joint_vel=library.joint_vel[clip, frame],
-        body_pos=library.body_pos[clip, frame],
-        body_quat=library.body_quat[clip, frame],
-        body_lin_vel=library.body_lin_vel[clip, frame],
-        body_ang_vel=library.body_ang_vel[clip, frame],
-        anchor_lin_acc=library.anchor_lin_acc[clip, frame],
-        anchor_ang_acc=library.anchor_ang_acc[clip, frame],
-    )
+    return jax.tree.map(lambda values: values[clip, frame], library.frames)
 
 
 @struct.dataclass
@@ -69,10 +47,10 @@ def anchor_between(
         return here + fraction * (there - here)
 
     return AnchorMotion(
-        pos=between(now.body_pos[:, anchor], following.body_pos[:, anchor]),
-        quat=rotation.slerp(now.body_quat[:, anchor], following.body_quat[:, anchor], fraction),
-        lin_vel=between(now.body_lin_vel[:, anchor], following.body_lin_vel[:, anchor]),
-        ang_vel=between(now.body_ang_vel[:, anchor], following.body_ang_vel[:, anchor]),
+        pos=between(now.bodies.pos[:, anchor], following.bodies.pos[:, anchor]),
+        quat=rotation.slerp(now.bodies.quat[:, anchor], following.bodies.quat[:, anchor], fraction),
+        lin_vel=between(now.bodies.lin_vel[:, anchor], following.bodies.lin_vel[:, anchor]),
+        ang_vel=between(now.bodies.ang_vel[:, anchor], following.bodies.ang_vel[:, anchor]),
         lin_acc=between(now.anchor_lin_acc, following.anchor_lin_acc),
         ang_acc=between(now.anchor_ang_acc, following.anchor_ang_acc),
     )
@@ -86,7 +64,7 @@ class AlignedBodies:
     quat: Array  # [env, key_body, 4]
 
 
-def align_to_anchor(reference: Reference, anchor: int, anchor_pos: Array, anchor_quat: Array) -> AlignedBodies:
+def align_to_anchor(reference: Frames, anchor: int, anchor_pos: Array, anchor_quat: Array) -> AlignedBodies:
     """Move the reference so that its anchor has the robot's x, y and yaw.
 
     Args:
@@ -95,10 +73,10 @@ def align_to_anchor(reference: Reference, anchor: int, anchor_pos: Array, anchor
         anchor_pos: [env, 3] the robot's anchor.
         anchor_quat: [env, 4].
     """
-    ref_pos, ref_quat = reference.body_pos[:, anchor], reference.body_quat[:, anchor]
+    ref_pos, ref_quat = reference.bodies.pos[:, anchor], reference.bodies.quat[:, anchor]
     turn = rotation.yaw_only(rotation.multiply(anchor_quat, rotation.conjugate(ref_quat)))[:, None]
     origin = jnp.concatenate([anchor_pos[:, :2], ref_pos[:, 2:]], axis=-1)[:, None]
     return AlignedBodies(
-        pos=origin + rotation.rotate(turn, reference.body_pos - ref_pos[:, None]),
-        quat=rotation.multiply(turn, reference.body_quat),
+        pos=origin + rotation.rotate(turn, reference.bodies.pos - ref_pos[:, None]),
+        quat=rotation.multiply(turn, reference.bodies.quat),
     )

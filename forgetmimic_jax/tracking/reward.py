@@ -14,21 +14,23 @@ from flax import struct
 from jax import Array
 
 from forgetmimic_jax.basics import rotation
+from forgetmimic_jax.motion.library import Frames
 from forgetmimic_jax.physics import BodyState
 from forgetmimic_jax.robot.model import RobotArrays
 from forgetmimic_jax.settings.config import RewardConfig
-from forgetmimic_jax.tracking.reference import AlignedBodies, Reference
+from forgetmimic_jax.tracking.reference import AlignedBodies
 
 
-class Pair(NamedTuple):
+@struct.dataclass
+class Pair:
     """A robot and the reference frame that it is compared with."""
 
-    reference: Reference
+    reference: Frames
     aligned: AlignedBodies  # the reference's key bodies, moved to the robot's anchor
     bodies: BodyState  # the robot's
-    anchor: int  # index of the anchor among the key bodies
     joint_pos: Array  # [env, joint] rad, the robot's
     joint_vel: Array  # [env, joint] rad/s
+    anchor: int = struct.field(pytree_node=False)  # index of the anchor among the key bodies
 
 
 class TrackingTerm(NamedTuple):
@@ -52,21 +54,21 @@ def _angle(a: Array, b: Array) -> Array:
 # difference.
 TERMS: tuple[TrackingTerm, ...] = (
     TrackingTerm("root_position", 0.25, 0.4,  # m
-                 lambda p: _square(p.reference.body_pos - p.bodies.pos)[:, p.anchor]),
+                 lambda p: _square(p.reference.bodies.pos - p.bodies.pos)[:, p.anchor]),
     TrackingTerm("root_orientation", 0.25, 0.5,  # rad
-                 lambda p: _angle(p.reference.body_quat, p.bodies.quat)[:, p.anchor]),
+                 lambda p: _angle(p.reference.bodies.quat, p.bodies.quat)[:, p.anchor]),
     TrackingTerm("root_linear_velocity", 0.25, 0.6,  # m/s
-                 lambda p: _square(p.reference.body_lin_vel - p.bodies.lin_vel)[:, p.anchor]),
+                 lambda p: _square(p.reference.bodies.lin_vel - p.bodies.lin_vel)[:, p.anchor]),
     TrackingTerm("root_angular_velocity", 0.25, 1.5,  # rad/s
-                 lambda p: _square(p.reference.body_ang_vel - p.bodies.ang_vel)[:, p.anchor]),
+                 lambda p: _square(p.reference.bodies.ang_vel - p.bodies.ang_vel)[:, p.anchor]),
     TrackingTerm("body_position", 0.25, 0.2,  # m
                  lambda p: _square(p.aligned.pos - p.bodies.pos).mean(-1)),
     TrackingTerm("body_orientation", 0.25, 0.4,  # rad
                  lambda p: _angle(p.aligned.quat, p.bodies.quat).mean(-1)),
     TrackingTerm("body_linear_velocity", 1.0, 1.0,  # m/s
-                 lambda p: _square(p.reference.body_lin_vel - p.bodies.lin_vel).mean(-1)),
+                 lambda p: _square(p.reference.bodies.lin_vel - p.bodies.lin_vel).mean(-1)),
     TrackingTerm("body_angular_velocity", 1.0, 3.14,  # rad/s
-                 lambda p: _square(p.reference.body_ang_vel - p.bodies.ang_vel).mean(-1)),
+                 lambda p: _square(p.reference.bodies.ang_vel - p.bodies.ang_vel).mean(-1)),
     TrackingTerm("joint_position", 0.25, 0.3,  # rad
                  lambda p: ((p.reference.joint_pos - p.joint_pos) ** 2).mean(-1)),
     TrackingTerm("joint_velocity", 0.25, 2.0,  # rad/s

@@ -100,7 +100,8 @@ def push(state: EnvState, velocity: Sequence[float] | np.ndarray) -> EnvState:
 def reference_qpos(robot: Robot, library: MotionLibrary, clip: int) -> np.ndarray:
     """A clip as configurations [frame, nq] of the robot."""
     length = int(library.length[clip])
-    parts = (library.body_pos[clip, :, robot.root], library.body_quat[clip, :, robot.root], library.joint_pos[clip])
+    frames = jax.tree.map(lambda values: values[clip], library.frames)
+    parts = (frames.bodies.pos[:, robot.root], frames.bodies.quat[:, robot.root], frames.joint_pos)
     return np.concatenate([np.asarray(part)[:length] for part in parts], axis=-1)
 
 

@@ -9,10 +9,9 @@ from scipy.spatial.transform import Rotation
 from forgetmimic_jax.evaluation.rollout import CHUNK, Evaluator, episode_starts, evaluation_setup, step_errors
 from forgetmimic_jax.physics import BodyState
 from forgetmimic_jax.policy.policy import Policy, init_policy
-from forgetmimic_jax.tracking.env import StepResult
 from forgetmimic_jax.tracking.observation import actor_size
-from forgetmimic_jax.tracking.reference import lookup
-from forgetmimic_jax.tracking.reward import Reward
+from forgetmimic_jax.tracking.reference import align_to_anchor, lookup
+from forgetmimic_jax.tracking.reward import Pair
 
 EPISODES = 4  # a clip; the library has two
 
@@ -158,12 +157,12 @@ def test_episodes_that_blow_up_are_counted_once_each_and_only_while_they_live(ev
 def test_step_errors_by_hand(evaluator, robot):
     """The robot stands 1 m east of the reference, turned by 90°, 2 cm too high, and stands on one foot."""
     envs = 2 * EPISODES
-    assets, state = evaluator._assets, evaluator.start()
+    assets = evaluator._assets
     reference = lookup(assets.library, jnp.zeros(envs, jnp.int32), jnp.full(envs, 10))
     turn = Rotation.from_euler("z", np.pi / 2)
-    pos = turn.apply(np.asarray(reference.body_pos).reshape(-1, 3)).reshape(reference.body_pos.shape)
+    pos = turn.apply(np.asarray(reference.bodies.pos).reshape(-1, 3)).reshape(reference.bodies.pos.shape)
     pos += [1.0, 0.0, 0.02]
-    quat = (turn * Rotation.from_quat(np.asarray(reference.body_quat).reshape(-1, 4), scalar_first=True)).as_quat(
+    quat = (turn * Rotation.from_quat(np.asarray(reference.bodies.quat).reshape(-1, 4), scalar_first=True)).as_quat(
         scalar_first=True
     )
     wrist = robot.key_bodies.index("left_wrist_yaw_link")
@@ -176,17 +175,12 @@ def test_step_errors_by_hand(evaluator, robot):
     knee = robot.joint_names.index("left_knee_joint")
     joint_pos[:, knee] = 2.85  # beyond 0.9 of its range
     off = joint_pos[0, knee] - float(reference.joint_pos[0, knee])
-    physics = dataclasses.replace(
-        state.physics,
-        qpos=state.physics.qpos.at[:, 7:].set(jnp.asarray(joint_pos)),
-        qvel=state.physics.qvel.at[:, 6:].set(reference.joint_vel + 0.5),
-    )
-    state = dataclasses.replace(state, physics=physics, bodies=bodies)
-    no = jnp.zeros(envs, bool)
-    result = StepResult(Reward(no, no, no, {}), no, no, no, {}, reference)
-    errors = {name: float(x[0]) for name, x in step_errors(evaluator._env, assets, state, result).items()}
+    aligned = align_to_anchor(reference, robot.anchor, bodies.pos[:, robot.anchor], bodies.quat[:, robot.anchor])
+    joint_vel = reference.joint_vel + 0.5
+    pair = Pair(reference, aligned, bodies, jnp.asarray(joint_pos), joint_vel, robot.anchor)
+    errors = {name: float(x[0]) for name, x in step_errors(robot, pair).items()}
 
-    world = np.linalg.norm(pos[0] - np.asarray(reference.body_pos[0]), axis=-1)
+    world = np.linalg.norm(pos[0] - np.asarray(reference.bodies.pos[0]), axis=-1)
     assert errors["mpkpe"] == pytest.approx(world.mean(), rel=1e-4)
     assert errors["anchor_position_error"] == pytest.approx(world[robot.anchor], rel=1e-4)
     assert errors["root_relative_mpkpe"] == pytest.approx((13 * 0.02 + 0.10) / 14, rel=1e-3)

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 
+import jax
 import numpy as np
 import pytest
 from motion_cases import waving
@@ -46,10 +47,10 @@ def test_shorter_clips_are_padded_with_their_last_frame(robot, folder):
     loaded = library.load_library(robot, folder)
     assert loaded.names == ("sway", "turn")
     assert loaded.length.tolist() == [40, 25]
-    assert loaded.joint_pos.shape == (2, 40, robot.num_joints)
-    assert loaded.body_pos.shape == (2, 40, len(robot.key_bodies), 3)
-    for field in ("joint_pos", "joint_vel", "body_pos", "body_quat", "body_lin_vel", "anchor_lin_acc"):
-        row = np.asarray(getattr(loaded, field))[1]
+    assert loaded.frames.joint_pos.shape == (2, 40, robot.num_joints)
+    assert loaded.frames.bodies.pos.shape == (2, 40, len(robot.key_bodies), 3)
+    for values in jax.tree.leaves(loaded.frames):
+        row = np.asarray(values)[1]
         np.testing.assert_array_equal(row[25:], np.broadcast_to(row[24], row[25:].shape))
 
 
@@ -57,7 +58,7 @@ def test_no_velocity_is_taken_across_clips(robot, folder):
     """Alone or beside another clip, a clip's arrays are the same."""
     alone = library.load_library(robot, folder, ["turn"])
     beside = library.load_library(robot, folder)
-    np.testing.assert_array_equal(alone.body_lin_vel[0], beside.body_lin_vel[1, :25])
+    np.testing.assert_array_equal(alone.frames.bodies.lin_vel[0], beside.frames.bodies.lin_vel[1, :25])
 
 
 def test_clips_are_loaded_in_the_order_asked_for(robot, folder):

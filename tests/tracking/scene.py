@@ -2,17 +2,19 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from forgetmimic_jax.motion.library import Frames
 from forgetmimic_jax.physics import BodyState
+from forgetmimic_jax.robot.bodies import Bodies
 from forgetmimic_jax.robot.model import Robot
-from forgetmimic_jax.tracking.reference import Reference
 
 
-def upright_scene(robot: Robot, num_envs: int = 1) -> tuple[Reference, BodyState]:
+def upright_scene(robot: Robot, num_envs: int = 1) -> tuple[Frames, BodyState]:
     """A reference at rest whose bodies hang anywhere, all upright, and a robot that is exactly there."""
     rng = np.random.default_rng(0)
     bodies = len(robot.key_bodies)
@@ -20,30 +22,15 @@ def upright_scene(robot: Robot, num_envs: int = 1) -> tuple[Reference, BodyState
     quat = np.tile([1.0, 0.0, 0.0, 0.0], (num_envs, bodies, 1))
     zeros = np.zeros((num_envs, bodies, 3))
     joints = np.zeros((num_envs, robot.num_joints))
-    reference = Reference(
-        **_float32(
-            joint_pos=joints,
-            joint_vel=joints,
-            body_pos=pos,
-            body_quat=quat,
-            body_lin_vel=zeros,
-            body_ang_vel=zeros,
-            anchor_lin_acc=np.zeros((num_envs, 3)),
-            anchor_ang_acc=np.zeros((num_envs, 3)),
-        )
-    )
+    still = np.zeros((num_envs, 3))
+    frames = Frames(joints, joints, Bodies(pos, quat, zeros, zeros), still, still)
+    reference = jax.tree.map(lambda values: jnp.asarray(values, jnp.float32), frames)
     return reference, on_reference(reference)
 
 
-def on_reference(reference: Reference) -> BodyState:
+def on_reference(reference: Frames) -> BodyState:
     """A robot whose key bodies are the reference's, touching nothing."""
-    return BodyState(
-        pos=reference.body_pos,
-        quat=reference.body_quat,
-        lin_vel=reference.body_lin_vel,
-        ang_vel=reference.body_ang_vel,
-        contact_force=jnp.zeros_like(reference.body_pos),
-    )
+    return BodyState(**vars(reference.bodies), contact_force=jnp.zeros_like(reference.bodies.pos))
 
 
 def turned(bodies: BodyState, yaw: float, shift: tuple[float, float]) -> BodyState:

@@ -1,5 +1,6 @@
 import dataclasses
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from forgetmimic_jax.motion.library import load_library
 from forgetmimic_jax.physics import BodyState, PhysicsParameters, PhysicsState
+from forgetmimic_jax.robot.bodies import Bodies
 from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.tracking.env import Environment, EnvState, make_assets, make_environment
@@ -67,12 +69,11 @@ def start(env: Environment, assets, clip: list[int], frame: list[int], gain: flo
 def on_frame(env: Environment, assets, clip, frame) -> tuple[PhysicsState, BodyState]:
     reference = lookup(assets.library, clip, frame)
     root = env.robot.root
-    qpos = jnp.concatenate([reference.body_pos[:, root], reference.body_quat[:, root], reference.joint_pos], axis=-1)
-    qvel = jnp.concatenate([reference.body_lin_vel[:, root], jnp.zeros((ENVS, 3)), reference.joint_vel], axis=-1)
-    bodies = BodyState(
-        reference.body_pos, reference.body_quat, reference.body_lin_vel, reference.body_ang_vel,
-        jnp.zeros_like(reference.body_pos),
-    )  # fmt: skip
+    qpos = jnp.concatenate(
+        [reference.bodies.pos[:, root], reference.bodies.quat[:, root], reference.joint_pos], axis=-1
+    )
+    qvel = jnp.concatenate([reference.bodies.lin_vel[:, root], jnp.zeros((ENVS, 3)), reference.joint_vel], axis=-1)
+    bodies = BodyState(**vars(reference.bodies), contact_force=jnp.zeros_like(reference.bodies.pos))
     return PhysicsState(qpos, qvel, jnp.zeros_like(qvel)), bodies
 
 
@@ -84,7 +85,7 @@ def follow(env: Environment, assets, state: EnvState, action=None):
 
 
 def rows(library, clip: list[int], frame: list[int], field: str) -> np.ndarray:
-    return np.asarray(getattr(library, field))[clip, frame]
+    return np.asarray(attrgetter(field)(library.frames))[clip, frame]
 
 
 def test_a_step_moves_to_the_next_frame_and_remembers_the_action(puppet_env, assets):
@@ -158,7 +159,9 @@ def test_reward_compares_with_the_frame_that_the_step_reaches(puppet_env, assets
     puppet_env.engine.next_physics, puppet_env.engine.next_bodies = state.physics, state.bodies  # it does not move
     _, result = tracking.step(puppet_env, assets, state, jnp.zeros((ENVS, 29)), KEY)
     assert (np.asarray(result.reward.normalized_tracking) < 0.9999).all()
-    np.testing.assert_array_equal(result.reference.body_pos, rows(assets.library, [0] * ENVS, [11] * ENVS, "body_pos"))
+    np.testing.assert_array_equal(
+        result.pair.reference.bodies.pos, rows(assets.library, [0] * ENVS, [11] * ENVS, "bodies.pos")
+    )
 
 
 def regularisation(env: Environment, assets, *, action=0.0, last_action=0.0, acc_before=0.0, acc=0.0) -> np.ndarray:
@@ -252,15 +255,15 @@ def anchor_track(env: Environment, library, clip: list[int], frame: list[int]) -
     """The library's anchor at the start of each physics step of a control step, by NumPy and SciPy."""
     anchor, substeps = env.robot.anchor, env.config.physics.substeps
     ends = np.array([frame, np.array(frame) + 1])
-    bodies = ("body_pos", "body_lin_vel", "body_ang_vel")
-    both = {name: np.asarray(getattr(library, name), np.float64)[clip, ends][:, :, anchor] for name in bodies}
+    bodies = ("bodies.pos", "bodies.lin_vel", "bodies.ang_vel")
+    both = {name: np.asarray(attrgetter(name)(library.frames), np.float64)[clip, ends][:, :, anchor] for name in bodies}
     for name in ("anchor_lin_acc", "anchor_ang_acc"):
-        both[name] = np.asarray(getattr(library, name), np.float64)[clip, ends]
-    quat = np.asarray(library.body_quat, np.float64)[clip, ends][:, :, anchor]
+        both[name] = np.asarray(attrgetter(name)(library.frames), np.float64)[clip, ends]
+    quat = np.asarray(library.frames.bodies.quat, np.float64)[clip, ends][:, :, anchor]
     track = []
     for part in np.arange(substeps) / substeps:
         now = {name: (1.0 - part) * values[0] + part * values[1] for name, values in both.items()}
-        now["body_quat"] = np.stack(
+        now["bodies.quat"] = np.stack(
             [
                 Slerp([0.0, 1.0], Rotation.from_quat(pair, scalar_first=True))(part).as_quat(scalar_first=True)
                 for pair in quat.swapaxes(0, 1)
@@ -276,7 +279,7 @@ def carried(env: Environment, assets, state: EnvState, track: list[dict[str, np.
         dataclasses.replace(
             state.bodies,
             **{
-                name: getattr(state.bodies, name).at[:, env.robot.anchor].set(jnp.asarray(now[f"body_{name}"]))
+                name: getattr(state.bodies, name).at[:, env.robot.anchor].set(jnp.asarray(now[f"bodies.{name}"]))
                 for name in ("pos", "quat", "lin_vel", "ang_vel")
             },
         )
@@ -301,15 +304,15 @@ def test_a_robot_on_the_reference_at_every_physics_step_feels_no_pull(robot, pup
     gain = np.array([0.6, 0.2, 0.4, 0.6])
     state = dataclasses.replace(start(env, shipped, clip, frame), wrench_gain=jnp.asarray(gain, jnp.float32))
     track = anchor_track(env, shipped.library, clip, frame)
-    speeds = np.linalg.norm(rows(shipped.library, clip, frame, "body_lin_vel")[:, robot.anchor], axis=-1)
+    speeds = np.linalg.norm(rows(shipped.library, clip, frame, "bodies.lin_vel")[:, robot.anchor], axis=-1)
     assert speeds.min() > 1.0  # m/s: 15 mm in the last three quarters of a control step
     mass, inertia = robot.model.body_mass.sum(), np.asarray(robot.arrays.inertia, np.float64)
     wrenches = carried(env, shipped, state, track)
     assert len(wrenches) == env.config.physics.substeps == 4
     for now, wrench in zip(track, wrenches, strict=True):
-        turn = Rotation.from_quat(now["body_quat"], scalar_first=True).as_matrix()
+        turn = Rotation.from_quat(now["bodies.quat"], scalar_first=True).as_matrix()
         world_inertia = turn @ inertia @ turn.swapaxes(-1, -2)
-        spin = now["body_ang_vel"]
+        spin = now["bodies.ang_vel"]
         force = mass * (now["anchor_lin_acc"] - [0.0, 0.0, -9.81])
         torque = np.einsum("eij,ej->ei", world_inertia, now["anchor_ang_acc"])
         torque += np.cross(spin, np.einsum("eij,ej->ei", world_inertia, spin))
@@ -326,22 +329,26 @@ def test_a_reference_of_constant_velocity_needs_the_weight_and_no_torque(robot, 
         """The anchor [..., 3 or 4] at times in frames."""
         seconds = 0.02 * np.asarray(time)[..., None]
         return {
-            "body_pos": np.array([0.0, 0.0, 1.0]) + velocity * seconds,
-            "body_quat": Rotation.from_rotvec((spin * seconds).reshape(-1, 3))
+            "bodies.pos": np.array([0.0, 0.0, 1.0]) + velocity * seconds,
+            "bodies.quat": Rotation.from_rotvec((spin * seconds).reshape(-1, 3))
             .as_quat(scalar_first=True)
             .reshape(*seconds.shape[:-1], 4),
-            "body_lin_vel": np.broadcast_to(velocity, (*seconds.shape[:-1], 3)),
-            "body_ang_vel": np.broadcast_to(spin, (*seconds.shape[:-1], 3)),
+            "bodies.lin_vel": np.broadcast_to(velocity, (*seconds.shape[:-1], 3)),
+            "bodies.ang_vel": np.broadcast_to(spin, (*seconds.shape[:-1], 3)),
         }
 
     library = assets.library
-    frames = np.broadcast_to(np.arange(library.joint_pos.shape[1]), library.joint_pos.shape[:2])
-    moved = {name: getattr(library, name).at[:, :, anchor].set(values) for name, values in at(frames).items()}
-    still = {name: jnp.zeros_like(getattr(library, name)) for name in ("anchor_lin_acc", "anchor_ang_acc")}
+    frames = np.broadcast_to(np.arange(library.frames.joint_pos.shape[1]), library.frames.joint_pos.shape[:2])
+    bodies = library.frames.bodies
+    moved = {name: getattr(bodies, name).at[:, :, anchor].set(at(frames)[f"bodies.{name}"]) for name in vars(bodies)}
+    none = jnp.zeros_like(library.frames.anchor_lin_acc)
+    still = {"anchor_lin_acc": none, "anchor_ang_acc": none}
     inertia = jnp.diag(jnp.array([1.0, 2.0, 3.0]))
     assets = dataclasses.replace(
         assets,
-        library=dataclasses.replace(library, **moved, **still),
+        library=dataclasses.replace(
+            library, frames=dataclasses.replace(library.frames, bodies=Bodies(**moved), **still)
+        ),
         robot=dataclasses.replace(assets.robot, inertia=inertia),
     )
     frame = np.array([0, 3, 10, 20])

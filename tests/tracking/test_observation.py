@@ -8,10 +8,12 @@ import pytest
 from scene import body_velocity, on_reference, posed, turned
 from scipy.spatial.transform import Rotation
 
+from forgetmimic_jax.motion.library import Frames
 from forgetmimic_jax.physics import BodyState, PhysicsState
+from forgetmimic_jax.robot.bodies import Bodies
 from forgetmimic_jax.settings.config import NoiseConfig
 from forgetmimic_jax.tracking.observation import actor_observation, actor_size, critic_observation, observation_noise
-from forgetmimic_jax.tracking.reference import Reference, lookup
+from forgetmimic_jax.tracking.reference import lookup
 
 # The actor's layout for 29 joints, from the design document.
 SLICES = {
@@ -53,10 +55,11 @@ def key_bodies(robot, data: mujoco.MjData) -> BodyState:
     return BodyState(*arrays, contact_force=jnp.zeros_like(arrays[0]))
 
 
-def as_reference(robot, data: mujoco.MjData) -> Reference:
+def as_reference(robot, data: mujoco.MjData) -> Frames:
     bodies, joints = key_bodies(robot, data), jnp.asarray(data.qpos[None, 7:], jnp.float32)
     zero = jnp.zeros((1, 3))
-    return Reference(joints, joints, bodies.pos, bodies.quat, bodies.lin_vel, bodies.ang_vel, zero, zero)
+    of_reference = Bodies(bodies.pos, bodies.quat, bodies.lin_vel, bodies.ang_vel)
+    return Frames(joints, joints, of_reference, zero, zero)
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +118,7 @@ def test_the_actor_knows_neither_place_nor_heading(robot, scene):
     reference = as_reference(robot, there)
     bodies = turned(on_reference(reference), 1.3, (4.0, -2.0))
     moved_reference = dataclasses.replace(
-        reference, body_pos=bodies.pos, body_quat=bodies.quat, body_lin_vel=bodies.lin_vel, body_ang_vel=bodies.ang_vel
+        reference, bodies=Bodies(bodies.pos, bodies.quat, bodies.lin_vel, bodies.ang_vel)
     )
     turn = Rotation.from_euler("z", -0.8)
     moved = physics_state(here)
@@ -141,7 +144,7 @@ def test_noise_is_uniform_in_its_half_width(part):
     np.testing.assert_allclose(noise.std(0), half_width / np.sqrt(3.0), rtol=0.06)
 
 
-def critic_of(robot, reference: Reference, bodies: BodyState, **changes) -> np.ndarray:
+def critic_of(robot, reference: Frames, bodies: BodyState, **changes) -> np.ndarray:
     arguments = dict(wrench=jnp.zeros((1, 6)), wrench_gain=jnp.zeros(1), phase=jnp.zeros(1), terms=jnp.ones((1, 10)))
     clean = jnp.zeros((1, 132))
     return np.asarray(critic_observation(clean, reference, bodies, robot.anchor, robot.root, **arguments | changes))[0]

@@ -46,21 +46,21 @@ def turns(quat) -> Rotation:
 
 def test_reset_moves_the_root_by_the_papers_ranges(robot, reset):
     reference, state = reset
-    assert_fills(state.qpos[:, :3] - reference.body_pos[:, robot.root], (0.05, 0.05, 0.01))
+    assert_fills(state.qpos[:, :3] - reference.bodies.pos[:, robot.root], (0.05, 0.05, 0.01))
 
 
 def test_reset_turns_the_root_about_the_worlds_axes(robot, reset):
     reference, state = reset
-    noise = turns(state.qpos[:, 3:7]) * turns(reference.body_quat[:, robot.root]).inv()
+    noise = turns(state.qpos[:, 3:7]) * turns(reference.bodies.quat[:, robot.root]).inv()
     assert_fills(noise.as_euler("xyz"), (0.1, 0.1, 0.2))
     np.testing.assert_allclose(np.linalg.norm(state.qpos[:, 3:7], axis=-1), 1.0, atol=1e-5)
 
 
 def test_reset_changes_the_roots_velocities_in_the_world(robot, reset):
     reference, state = reset
-    assert_fills(state.qvel[:, :3] - reference.body_lin_vel[:, robot.root], (0.5, 0.5, 0.2))
+    assert_fills(state.qvel[:, :3] - reference.bodies.lin_vel[:, robot.root], (0.5, 0.5, 0.2))
     in_world = turns(state.qpos[:, 3:7]).apply(np.asarray(state.qvel[:, 3:6]))
-    assert_fills(in_world - np.asarray(reference.body_ang_vel[:, robot.root]), (0.52, 0.52, 0.78))
+    assert_fills(in_world - np.asarray(reference.bodies.ang_vel[:, robot.root]), (0.52, 0.52, 0.78))
 
 
 def test_reset_moves_joints_by_a_tenth_of_a_rad_and_keeps_their_velocities(robot, reset):

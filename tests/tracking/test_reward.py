@@ -40,7 +40,7 @@ WITH_JOINT_VELOCITY = RewardConfig(joint_velocity=1.0)
 @partial(jax.jit, static_argnums=(0, 1))
 def compiled_reward(config, anchor, reference, bodies, joint_pos, joint_vel):
     aligned = align_to_anchor(reference, anchor, bodies.pos[:, anchor], bodies.quat[:, anchor])
-    kernels = tracking_kernels(Pair(reference, aligned, bodies, anchor, joint_pos, joint_vel))
+    kernels = tracking_kernels(Pair(reference, aligned, bodies, joint_pos, joint_vel, anchor))
     return *tracking_reward(kernels, config), kernels
 
 
@@ -158,7 +158,7 @@ def test_root_terms_see_where_the_robot_stands_and_its_heading(robot, library):
 def test_root_velocity_is_compared_in_the_world(robot, library):
     reference = lookup(library, jnp.array([0]), jnp.array([40]))
     bodies = turned(on_reference(reference), np.pi / 2, (0.0, 0.0))
-    velocity = np.asarray(reference.body_lin_vel[0, robot.anchor])
+    velocity = np.asarray(reference.bodies.lin_vel[0, robot.anchor])
     difference = velocity - Rotation.from_euler("z", np.pi / 2).apply(velocity)
     expected = np.exp(-0.25 * (difference @ difference) / 0.36)
     np.testing.assert_allclose(terms_of(robot, reference, bodies)["root_linear_velocity"], expected, rtol=1e-4)
@@ -170,8 +170,11 @@ def test_a_heading_error_of_half_a_rad_costs_in_the_body_velocities(robot):
     reference, _ = upright_scene(robot)
     reference = dataclasses.replace(
         reference,
-        body_lin_vel=reference.body_lin_vel + jnp.array([2.0, 0.0, 0.0]),
-        body_ang_vel=reference.body_ang_vel + jnp.array([0.0, 3.0, 0.0]),
+        bodies=dataclasses.replace(
+            reference.bodies,
+            lin_vel=reference.bodies.lin_vel + jnp.array([2.0, 0.0, 0.0]),
+            ang_vel=reference.bodies.ang_vel + jnp.array([0.0, 3.0, 0.0]),
+        ),
     )
     straight = terms_of(robot, reference, on_reference(reference))
     astray = terms_of(robot, reference, turned(on_reference(reference), 0.5, (0.0, 0.0)))
