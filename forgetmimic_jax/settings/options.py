@@ -23,8 +23,7 @@ Settings = Annotated[list[list[str]], tyro.conf.UseAppendAction, tyro.conf.arg(m
 
 def parse(options: type[T], command: str, arguments: Sequence[str] | None = None) -> T:
     """The command line, or `arguments`, as `options`; flags that are none end the command with exit code 2."""
-    name = f"python -m forgetmimic_jax.{command}"
-    return tyro.cli(options, prog=name, args=arguments, config=(tyro.conf.FlagCreatePairsOff,))
+    return tyro.cli(options, prog=f"forgetmimic {command}", args=arguments, config=(tyro.conf.FlagCreatePairsOff,))
 
 
 def check_same(options: Any, saved: dict[str, Any]) -> None:

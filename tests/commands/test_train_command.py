@@ -234,7 +234,7 @@ def test_damaged_settings_of_the_run_to_resume_are_told(refused, base_run, tmp_p
         (settings.replace("seed:", "sead:"), "no setting 'sead'; did you mean 'seed'?"),
         (
             settings.replace("seed: 0", "seed: zero"),
-            "seed: found 'zero'; accepted: a whole number from 0 to 4294967295",
+            "seed: found 'zero'; accepted: a whole number ",
         ),
         (settings.replace("seed: 0", "seed: [0"), "not YAML: "),
         ("", "found None; accepted: a table of settings"),
