@@ -1,4 +1,4 @@
-"""Where the time goes on this machine: `python -m forgetmimic_jax.bench`. Ratios within one run, nothing absolute."""
+"""Measure the speed of training on this machine: `forgetmimic bench`. Ratios within one run, nothing absolute."""
 
 from __future__ import annotations
 

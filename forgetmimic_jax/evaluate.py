@@ -1,4 +1,4 @@
-"""Evaluate a checkpoint clip by clip: `python -m forgetmimic_jax.evaluate --robot g1`."""
+"""Evaluate a checkpoint clip by clip: `forgetmimic evaluate --robot g1`."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Options:
 
 def main(options: Options) -> None:
     """Evaluate, write the files and print the table."""
-    from forgetmimic_jax.basics.console import closing
+    from forgetmimic_jax.basics.console import closing, command_line
     from forgetmimic_jax.evaluation.evaluate import cost, evaluate, show_and_write
     from forgetmimic_jax.training.comparison import load_comparison
     from forgetmimic_jax.training.folder import check_writable, folder_of
@@ -65,8 +65,8 @@ def main(options: Options) -> None:
         seed=options.seed,
         budget={name: cost(info) for name, info in compared.info.items()},
     )
-    base = f" BASE={options.checkpoint}" if options.checkpoint and list(compared.info) == ["base"] else ""
-    closing(show_and_write(output, document), f"make unlearn ROBOT={options.robot}{base}")
+    base = options.checkpoint if list(compared.info) == ["base"] else None
+    closing(show_and_write(output, document), command_line("unlearn", robot=options.robot, base=base))
 
 
 if __name__ == "__main__":

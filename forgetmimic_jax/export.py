@@ -1,4 +1,4 @@
-"""Take a policy away as ONNX: `python -m forgetmimic_jax.export --checkpoint runs/...`."""
+"""Write a policy as ONNX for a robot's software: `forgetmimic export --checkpoint runs/...`."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def main(options: Options) -> None:
     import numpy as np
     from rich.console import Console
 
-    from forgetmimic_jax.basics.console import closing, progress
+    from forgetmimic_jax.basics.console import closing, command_line, progress
     from forgetmimic_jax.basics.files import write_atomically
     from forgetmimic_jax.evaluation.rollout import Evaluator
     from forgetmimic_jax.exchange.closed_loop import run_episodes
@@ -105,7 +105,7 @@ def main(options: Options) -> None:
         f"tracking equals the evaluation's to {early:.0e}; later, rounding may grow at contacts.",
         highlight=False,
     )
-    closing({"policy": output}, f"make evaluate ROBOT={options.robot} CHECKPOINT={path} EPISODES=100")
+    closing({"policy": output}, command_line("evaluate", robot=options.robot, checkpoint=path, episodes=100))
 
 
 def early_difference(one: Rollout, other: Rollout) -> float:

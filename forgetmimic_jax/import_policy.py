@@ -1,4 +1,4 @@
-"""Unlearn from the policy you already have: `python -m forgetmimic_jax.import_policy --policy model_3000.pt`."""
+"""Make a base checkpoint of an rsl_rl or ONNX policy: `forgetmimic import-policy --policy model_3000.pt`."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def main(options: Options) -> None:
     import numpy as np
     from rich.console import Console
 
-    from forgetmimic_jax.basics.console import closing
+    from forgetmimic_jax.basics.console import closing, command_line
     from forgetmimic_jax.exchange.imported import check_actor, notes, with_actor, within_limit
     from forgetmimic_jax.exchange.onnx_actor import OnnxActor
     from forgetmimic_jax.exchange.onnx_reader import read_onnx
@@ -112,8 +112,8 @@ def main(options: Options) -> None:
     if not is_onnx:
         told.append("A .pt does not name its observations and joints: they are taken to be in this project's order.")
     Console().print("\n".join(told), highlight=False, soft_wrap=True)
-    library = f" LIBRARY={options.library}" if options.library else ""
-    closing({"base policy": output}, f"make evaluate ROBOT={options.robot}{library} CHECKPOINT={output}")
+    following = command_line("evaluate", robot=options.robot, library=options.library, checkpoint=output)
+    closing({"base policy": output}, following)
 
 
 def _observations(setup: Setup, seed: int) -> Array:
@@ -141,4 +141,4 @@ def _observations(setup: Setup, seed: int) -> Array:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse(Options, "import_policy")))
+    run_command(lambda: main(parse(Options, "import-policy")))

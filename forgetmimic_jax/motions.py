@@ -1,4 +1,4 @@
-"""Make, check and look at libraries of clips: `python -m forgetmimic_jax.motions import FILE --name NAME`."""
+"""Make, check and look at libraries of clips: `forgetmimic motions import FILE --name NAME`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from forgetmimic_jax.basics.console import closing
+from forgetmimic_jax.basics.console import closing, command_line
 from forgetmimic_jax.basics.errors import InputError, run_command
 from forgetmimic_jax.settings.options import comma_separated, parse
 
@@ -170,7 +170,7 @@ def import_motion(robot: Robot, options: Import) -> None:
     _print_table([measure(robot, clip)], {})
     closing(
         {"clip": file, "library": folder},
-        f"make pretrain ROBOT={robot.name} LIBRARY={folder}",
+        command_line("train", robot=robot.name, library=folder),
     )
 
 
@@ -192,7 +192,7 @@ def retarget(robot: Robot, options: Retarget) -> None:
     recipe.retarget_library(robot, options.source, options.output, names, report=lambda name: print(name, flush=True))
     closing(
         {"library": options.output},
-        f"make motions ROBOT={robot.name} ARGS='check --library {options.output}'",
+        command_line("motions", "check", robot=robot.name, library=options.output),
     )
 
 
@@ -209,7 +209,7 @@ def check(robot: Robot, options: Check) -> None:
     failed = [quality.name for quality in measures if quality.failures()]
     closing(
         {"library": folder, **({"drawing": options.draw} if options.draw else {})},
-        f"make pretrain ROBOT={robot.name} LIBRARY={folder}",
+        command_line("train", robot=robot.name, library=folder),
     )
     if failed:
         raise InputError(f"{folder}: {len(failed)} of {len(clips)} clips miss the bar: {', '.join(failed)}")
@@ -233,9 +233,9 @@ def show(robot: Robot, options: Show) -> None:
     shipped_with_policy = (folder / "base").is_dir()
     closing(
         {"drawing": output, "clip": folder / f"{options.clip}.npz"},
-        f"make unlearn ROBOT={robot.name} TARGETS={options.clip}"
+        command_line("unlearn", robot=robot.name, targets=options.clip)
         if shipped_with_policy
-        else f"make pretrain ROBOT={robot.name} LIBRARY={folder}",
+        else command_line("train", robot=robot.name, library=folder),
     )
 
 
@@ -247,7 +247,7 @@ def list_clips(robot: Robot, options: List) -> None:
         print(f"{clip.name:<{width}}  {clip.seconds:7.2f} s  {entries[clip.name].get('source', '')}")
     closing(
         {"library": folder},
-        f"make motions ROBOT={robot.name} ARGS='show {clips[0].name} --library {folder}'",
+        command_line("motions", f"show {clips[0].name}", robot=robot.name, library=folder),
     )
 
 

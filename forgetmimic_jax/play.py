@@ -1,4 +1,4 @@
-"""Watch policies live in a web page: `python -m forgetmimic_jax.play --robot g1`."""
+"""Watch policies live in a web page: `forgetmimic play --robot g1`."""
 
 from __future__ import annotations
 

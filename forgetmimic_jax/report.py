@@ -1,4 +1,4 @@
-"""One page to hand on: `python -m forgetmimic_jax.report --run runs/unlearn-g1-001`."""
+"""Write one HTML page about an unlearning run: `forgetmimic report --run runs/unlearn-g1-001`."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def main(options: Options) -> None:
     from markupsafe import Markup
     from rich.console import Console
 
-    from forgetmimic_jax.basics.console import closing
+    from forgetmimic_jax.basics.console import closing, command_line
     from forgetmimic_jax.basics.files import read_rows, write_atomically
     from forgetmimic_jax.evaluation import plots, tables
     from forgetmimic_jax.evaluation.verdict import RULES, judge
@@ -115,7 +115,7 @@ def main(options: Options) -> None:
     console.print(f"{verdict.word}: {' '.join(verdict.reasons)}", highlight=False, soft_wrap=True)
     if films_missing:
         console.print(films_missing, highlight=False, soft_wrap=True)
-    closing({"report": output, "facts": as_json}, f"make export ROBOT={document['robot']} CHECKPOINT={path}")
+    closing({"report": output, "facts": as_json}, command_line("export", robot=document["robot"], checkpoint=path))
 
 
 def read_evaluation(run: Path) -> dict[str, Any]:
@@ -124,6 +124,7 @@ def read_evaluation(run: Path) -> dict[str, Any]:
     Raises:
         InputError: no such run, or an evaluation that is damaged or of something else.
     """
+    from forgetmimic_jax.basics.console import command_line
     from forgetmimic_jax.evaluation.metrics import BASE, UNLEARNED, ZERO_ACTION
 
     path = run / "evaluation.json"
@@ -134,9 +135,8 @@ def read_evaluation(run: Path) -> dict[str, Any]:
         present = set(document["policies"])
         targets = list(document["targets"])
     except FileNotFoundError:
-        raise InputError(
-            f"{path}: not found; make it first, with: make evaluate CHECKPOINT={run}/checkpoints/..."
-        ) from None
+        first = command_line("evaluate", checkpoint=f"{run}/checkpoints/...")
+        raise InputError(f"{path}: not found; make it first, with: {first}") from None
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: damaged: {type(error).__name__}: {error}") from None
     missing = [policy for policy in (BASE, UNLEARNED, ZERO_ACTION) if policy not in present]

@@ -1,4 +1,4 @@
-"""Several unlearning runs that differ in one thing: `python -m forgetmimic_jax.sweep lambda`."""
+"""Several unlearning runs that differ in one thing: `forgetmimic sweep lambda`."""
 
 from __future__ import annotations
 

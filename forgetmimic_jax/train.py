@@ -1,4 +1,4 @@
-"""Train a base policy: `python -m forgetmimic_jax.train --robot g1`."""
+"""Train a base policy: `forgetmimic train --robot g1`."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Options:
 
 def main(options: Options) -> None:
     """Train, and say where the checkpoint is."""
-    from forgetmimic_jax.basics.console import closing
+    from forgetmimic_jax.basics.console import closing, command_line
     from forgetmimic_jax.settings.config import load_config, preset
     from forgetmimic_jax.tracking.setup import make_setup
     from forgetmimic_jax.training.folder import BEST, prepare_folder
@@ -66,7 +66,7 @@ def main(options: Options) -> None:
     if best.is_dir():
         files |= {"best policy": best, "clips over time": output / "evaluations.png"}
     files |= {"curves": output / "metrics.jsonl", "TensorBoard": output / "events"}
-    closing(files, f"make evaluate ROBOT={config.robot} CHECKPOINT={files.get('best policy', path)}")
+    closing(files, command_line("evaluate", robot=config.robot, checkpoint=files.get("best policy", path)))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Forget chosen clips: `python -m forgetmimic_jax.unlearn --robot g1 --targets punch,kick`."""
+"""Forget chosen clips: `forgetmimic unlearn --robot g1 --targets punch,kick`."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class Options:
 
 def main(options: Options) -> None:
     """Unlearn, evaluate base, new policy and zero action, and print what was forgotten and what was kept."""
-    from forgetmimic_jax.basics.console import closing
+    from forgetmimic_jax.basics.console import closing, command_line
     from forgetmimic_jax.evaluation.evaluate import cost, evaluate, show_and_write
     from forgetmimic_jax.tracking.setup import make_setup
     from forgetmimic_jax.training import checkpoint
@@ -114,7 +114,7 @@ def main(options: Options) -> None:
         raise interrupted(config, output) from None
     name = f"{method.result.replace('_', '-')} policy"
     files = {name: path, **show_and_write(output, document), "curves": output / "metrics.jsonl"}
-    closing(files, f"make evaluate ROBOT={config.robot} CHECKPOINT={path} EPISODES=100")
+    closing(files, command_line("evaluate", robot=config.robot, checkpoint=path, episodes=100))
 
 
 def config_of_new_run(options: Options) -> Config:

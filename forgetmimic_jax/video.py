@@ -1,4 +1,4 @@
-"""Film what a policy does clip by clip: `python -m forgetmimic_jax.video --robot g1`."""
+"""Film what a policy does clip by clip: `forgetmimic video --robot g1`."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def main(options: Options) -> None:
     """Record the episodes, draw and write the films, and print how the policies did in them."""
     from rich.console import Console
 
-    from forgetmimic_jax.basics.console import closing, progress
+    from forgetmimic_jax.basics.console import closing, command_line, progress
     from forgetmimic_jax.basics.files import write_atomically
     from forgetmimic_jax.training.comparison import load_comparison
     from forgetmimic_jax.training.folder import check_writable, folder_of
@@ -88,9 +88,8 @@ def main(options: Options) -> None:
             sheet.append(film.stills(frames, options.stills))
     write_atomically(output / "contact_sheet.png", film.contact_sheet(sheet))
     Console().print(_table(episodes, compared.targets))
-    chosen = f" CHECKPOINT={path}" if options.checkpoint else ""
     files = {"films": output / "*.mp4", "for pages": output / "*.gif", "all clips": output / "contact_sheet.png"}
-    closing(files, f"make play ROBOT={options.robot}{chosen}")
+    closing(files, command_line("play", robot=options.robot, checkpoint=options.checkpoint))
 
 
 def _table(episodes: Sequence[Episode], targets: Sequence[str]):

@@ -17,6 +17,9 @@ from forgetmimic_jax.tracking.setup import Setup
 # Compiling is most of what the tests wait for; this makes it three times as fast. JAX reads it when it first starts.
 os.environ["XLA_FLAGS"] += " --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 
+# As under `make test`, also without make: what a command says to do next is then a target of make.
+os.environ["MAKELEVEL"] = "1"
+
 SWAY_FRAMES, TURN_FRAMES = 80, 41
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"  # real files of other projects, not committed
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import os
+import shlex
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+if TYPE_CHECKING:
+    from rich.console import Console
 
 Report = Callable[[int, int, Mapping[str, float]], None]
 
@@ -36,6 +39,16 @@ def progress(
         report(iterations done, environment steps done, metrics to show), to be called after each iteration. Time before
         the first report is not counted: it is compilation.
     """
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
     console = console or Console()
     clock = _Clock()
     if console.is_terminal:
@@ -62,8 +75,32 @@ def progress(
     yield report
 
 
+def command_line(command: str, *words: str, **flags: object) -> str:
+    """What to type for a command: a target of make where make started this process, otherwise `forgetmimic COMMAND`.
+
+    Args:
+        command: its name.
+        words: what comes before the flags, such as `check` of `motions check`.
+        flags: values by name; None leaves a flag out, True stands for a flag without a value.
+    """
+    given = {name: value for name, value in flags.items() if value is not None}
+    if "MAKELEVEL" in os.environ:
+        target = {"train": "pretrain"}.get(command, command)
+        arguments = [f"ARGS={_word(' '.join(words))}"] if words else []
+        arguments += [f"{name.upper()}={_word(value)}" for name, value in given.items()]
+        return " ".join(["make", target, *arguments])
+    parts = [f"--{name}" if value is True else f"--{name} {_word(value)}" for name, value in given.items()]
+    return " ".join(["forgetmimic", command, *words, *parts])
+
+
+def _word(value: object) -> str:
+    return "1" if value is True else shlex.quote(str(value))
+
+
 def closing(files: Mapping[str, Path], next_command: str, *, console: Console | None = None) -> None:
     """Where the results went (what they are: path), and what to try next."""
+    from rich.console import Console
+
     console = console or Console()
     width = max((len(what) for what in files), default=0)
     lines = [f"{what:<{width}}  {path}" for what, path in files.items()]

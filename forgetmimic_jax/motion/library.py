@@ -20,12 +20,13 @@ from jax import Array
 
 from forgetmimic_jax.basics.errors import InputError, nearest
 from forgetmimic_jax.basics.files import write_atomically
+from forgetmimic_jax.basics.places import shipped
 from forgetmimic_jax.motion.clip import Clip, read_clip, write_clip
 from forgetmimic_jax.motion.kinematics import body_motion, configuration, rate, resample
 from forgetmimic_jax.robot.bodies import Bodies, Values
 from forgetmimic_jax.robot.model import Robot
 
-DATA_DIR = Path(__file__).resolve().parents[2] / "data"
+DATA_DIR = shipped("data")
 MANIFEST = "manifest.json"
 SCHEMA = 1
 MAX_LINEAR_ACCELERATION = 50.0  # m/s^2, the assistive wrench's clip on the reference

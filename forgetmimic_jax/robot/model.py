@@ -18,8 +18,9 @@ from flax import struct
 from jax import Array
 
 from forgetmimic_jax.basics.errors import InputError, nearest
+from forgetmimic_jax.basics.places import shipped
 
-ROBOTS_DIR = Path(__file__).resolve().parents[2] / "robots"
+ROBOTS_DIR = shipped("robots")
 CONTACT_SENSOR = "contact_"
 VISUAL_GROUP = 2  # the geom group of the shapes that are only seen
 G1_ROOT_HEIGHT, G1_MASS = 0.793, 33.341142  # m, of the G1's pelvis in its MJCF; kg

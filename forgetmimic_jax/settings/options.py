@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import tyro
 import yaml
 
-from forgetmimic_jax.basics.errors import InputError, nearest
-from forgetmimic_jax.settings.config import Config, PhysicsConfig, SamplingConfig, from_dict, to_dict
+from forgetmimic_jax.basics.errors import InputError
+from forgetmimic_jax.settings.checked import from_dict
+from forgetmimic_jax.settings.config import Config, Engine, PhysicsConfig, SamplingConfig, to_dict
 
 T = TypeVar("T")
 C = TypeVar("C", Config, PhysicsConfig, SamplingConfig)
@@ -22,8 +23,7 @@ Settings = Annotated[list[list[str]], tyro.conf.UseAppendAction, tyro.conf.arg(m
 
 def parse(options: type[T], command: str, arguments: Sequence[str] | None = None) -> T:
     """The command line, or `arguments`, as `options`; flags that are none end the command with exit code 2."""
-    name = f"python -m forgetmimic_jax.{command}"
-    return tyro.cli(options, prog=name, args=arguments, config=(tyro.conf.FlagCreatePairsOff,))
+    return tyro.cli(options, prog=f"forgetmimic {command}", args=arguments, config=(tyro.conf.FlagCreatePairsOff,))
 
 
 def check_same(options: Any, saved: dict[str, Any]) -> None:
@@ -49,35 +49,25 @@ def override(config: Config, settings: Iterable[str]) -> Config:
     """The config with settings of the form 'ppo.learning_rate=1e-4' replaced.
 
     Raises:
-        InputError: not of that form, an unknown setting or a value of the wrong type.
+        InputError: not of that form, an unknown setting, or a value that is not accepted.
     """
     content = to_dict(config)
+    from_dict(Config, content)  # a bad value of another flag is not of --set
     for setting in settings:
         path, separator, text = setting.partition("=")
         if not separator:
-            raise InputError(f"--set {setting}: expected SECTION.NAME=VALUE, such as ppo.learning_rate=1e-4")
+            raise InputError(f"--set {setting}: accepted: SECTION.NAME=VALUE, such as ppo.learning_rate=1e-4")
         *sections, name = path.split(".")
-        table: Any = content
+        table: dict[str, Any] = content
         for section in sections:
             if not isinstance(table.get(section), dict):
-                sections_here = [key for key, value in table.items() if isinstance(value, dict)]
-                raise InputError(f"--set {setting}: no section '{section}'; {nearest(section, sections_here)}")
+                table[section] = {}  # no such section, which `from_dict` says
             table = table[section]
-        table[name] = _value(text, setting)
-    return from_dict(Config, content, "--set")
-
-
-def _value(text: str, setting: str) -> Any:
-    try:
-        value = yaml.safe_load(text)
-    except yaml.YAMLError:
-        raise InputError(f"--set {setting}: '{text}' is no value; expected a number, a word or [a, list]") from None
-    if isinstance(value, str):
         try:
-            return float(value)  # YAML 1.1 reads 1e-4 as a string
-        except ValueError:
-            return value
-    return value
+            table[name] = yaml.safe_load(text)
+        except yaml.YAMLError:
+            raise InputError(f"--set {setting}: found '{text}'; accepted: a number, a word or [a, list]") from None
+    return from_dict(Config, content, "--set", strict=False)  # YAML reads 1e-4 as text
 
 
 def replace_given(config: C, **values: Any) -> C:
@@ -88,6 +78,6 @@ def replace_given(config: C, **values: Any) -> C:
     return dataclasses.replace(config, **given)
 
 
-def on_engine(config: Config, engine: Literal["auto", "native", "mjx", "mjx-warp"] | None) -> Config:
+def on_engine(config: Config, engine: Engine | None) -> Config:
     """The config on another physics engine, if one is named."""
     return dataclasses.replace(config, physics=replace_given(config.physics, engine=engine))

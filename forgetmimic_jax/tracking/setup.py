@@ -8,12 +8,11 @@ from pathlib import Path
 import jax
 
 from forgetmimic_jax.basics.errors import InputError, nearest
+from forgetmimic_jax.basics.places import cache_folder
 from forgetmimic_jax.motion.library import DATA_DIR, MotionLibrary, library_hash, load_library, read_manifest
 from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.robot.model import Robot, load_robot
 from forgetmimic_jax.settings.config import Config, validate
-
-COMPILATION_CACHE = DATA_DIR.parent / ".cache" / "jax"  # what XLA compiled is not compiled again at the next start
 
 
 @dataclass(frozen=True)
@@ -35,7 +34,7 @@ def make_setup(config: Config) -> Setup:
     """
     validate(config)
     if not jax.config.values["jax_compilation_cache_dir"]:
-        jax.config.update("jax_compilation_cache_dir", str(COMPILATION_CACHE))
+        jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "jax"))
     robot = load_robot(
         config.robot,
         timestep=config.physics.timestep,

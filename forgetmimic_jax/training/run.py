@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from rich.console import Console
 
+from forgetmimic_jax.basics.console import command_line
 from forgetmimic_jax.basics.console import progress as progress_bar
 from forgetmimic_jax.basics.errors import Interrupted
 from forgetmimic_jax.ppo.state import TrainState
@@ -103,11 +104,9 @@ def run(setup: Setup, directory: Path, *, description: str, resume: bool = False
 
 def interrupted(config: Config, directory: Path) -> Interrupted:
     """What a stopped run says at its end: what it saved, and the command that continues it."""
-    command = "unlearn" if config.unlearn.targets else "pretrain"
-    return Interrupted(
-        f"stopped; saved {newest_checkpoint(directory)}; "
-        f"continue with: make {command} ROBOT={config.robot} RESUME=1 OUTPUT={directory}"
-    )
+    command = "unlearn" if config.unlearn.targets else "train"
+    again = command_line(command, robot=config.robot, resume=True, output=directory)
+    return Interrupted(f"stopped; saved {newest_checkpoint(directory)}; continue with: {again}")
 
 
 LIVE = {

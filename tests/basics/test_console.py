@@ -3,7 +3,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from forgetmimic_jax.basics.console import closing, progress
+from forgetmimic_jax.basics.console import closing, command_line, progress
 
 
 def test_without_a_terminal_there_are_plain_lines():
@@ -25,3 +25,15 @@ def test_closing_names_files_and_the_next_command_unbroken():
     )
     assert "table  runs/a/long/enough/to/wrap/evaluation.md\n" in console.file.getvalue()
     assert console.file.getvalue().endswith("Next: make evaluate CHECKPOINT=[x]\n")
+
+
+def test_make_is_answered_with_targets_of_make(monkeypatch):
+    monkeypatch.setenv("MAKELEVEL", "1")
+    assert command_line("train", robot="g1", base=None, resume=True) == "make pretrain ROBOT=g1 RESUME=1"
+    assert command_line("motions", "show kick", library=Path("a b")) == "make motions ARGS='show kick' LIBRARY='a b'"
+
+
+def test_the_program_is_answered_with_its_own_flags(monkeypatch):
+    monkeypatch.delenv("MAKELEVEL", raising=False)
+    assert command_line("train", robot="g1", base=None, resume=True) == "forgetmimic train --robot g1 --resume"
+    assert command_line("motions", "show kick", library=Path("a b")) == "forgetmimic motions show kick --library 'a b'"

@@ -1,33 +1,91 @@
 import dataclasses
 import importlib
 import re
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
+from forgetmimic_jax import __main__ as program
 from forgetmimic_jax.settings.options import parse
 
-COMMANDS = ["train", "unlearn", "evaluate", "bench", "export", "import_policy", "play", "report", "video"]
+PACKAGE = Path(program.__file__).parent
+HEAVY = {"jax", "mujoco", "numpy", "scipy", "matplotlib", "orbax", "rich"}  # what `--help` need not wait for
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+def run(monkeypatch, *arguments: str) -> int:
+    """The exit code of `forgetmimic ARGUMENTS`."""
+    monkeypatch.setattr(sys, "argv", ["forgetmimic", *arguments])
+    try:
+        program.main()
+    except SystemExit as exit_:
+        return exit_.code
+    return 0
+
+
+def test_the_commands_are_the_modules_at_the_top_of_the_package():
+    files = {path.stem.replace("_", "-") for path in PACKAGE.glob("*.py")}
+    assert set(program.commands()) == files - {"--init--", "--main--"}
+
+
+@pytest.mark.parametrize("arguments", [[], ["--help"], ["-h"]])
+def test_without_a_command_the_program_lists_them_with_a_line_each(monkeypatch, capsys, arguments):
+    assert run(monkeypatch, *arguments) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "usage: forgetmimic COMMAND [flags]"
+    assert "  unlearn        Forget chosen clips" in lines
+    assert "  import-policy  Make a base checkpoint of an rsl_rl or ONNX policy" in lines
+    listed = [line.split() for line in lines if line.startswith("  ")]
+    assert [name for name, *_ in listed] == list(program.commands())
+    assert all(words for _, *words in listed)
+
+
+def test_an_unknown_command_is_refused_with_the_nearest_name(monkeypatch, capsys):
+    assert run(monkeypatch, "unlern", "--robot", "g1") == 2
+    assert capsys.readouterr() == ("", "error: no command 'unlern'; did you mean 'unlearn'?\n")
+
+
+def test_a_command_gets_the_arguments_after_its_name(monkeypatch, capsys):
+    assert run(monkeypatch, "import-policy", "--policy", "model.h5", "--seed", "-1") == 2
+    assert capsys.readouterr() == ("", "error: --seed: found -1; accepted: 0 or more\n")
+
+
+@pytest.mark.parametrize("command", [name for name in program.commands() if name != "motions"])
 def test_help_lists_every_option_with_its_default(command, capsys):
-    options = importlib.import_module(f"forgetmimic_jax.{command}").Options
+    options = importlib.import_module(f"forgetmimic_jax.{command.replace('-', '_')}").Options
     with pytest.raises(SystemExit) as exit_:
         parse(options, command, ["--help"])
     assert exit_.value.code == 0
     text = re.sub(r"[\s│]+", " ", capsys.readouterr().out)
-    assert f"usage: python -m forgetmimic_jax.{command} [-h]" in text
+    assert f"usage: forgetmimic {command} [-h]" in text
     for option in dataclasses.fields(options):
-        assert f" --{option.name} " in text
-        if option.default is not dataclasses.MISSING:
-            assert f"(default: {option.default})" in text.split(f" --{option.name} ")[-1]
+        flag = f" --{option.name.replace('_', '-')} "
+        assert flag in text or option.name == "kind"  # which is positional
+        if isinstance(option.default, str | int | float | Path):
+            assert f"(default: {option.default})" in text.split(flag)[-1]
+
+
+def test_help_waits_for_no_heavy_import():
+    """Every command's module, imported one after the other in a fresh process; each line names what it brought."""
+    code = (
+        "import importlib, sys\n"
+        "for name in sys.argv[2:]:\n"
+        "    importlib.import_module(f'forgetmimic_jax.{name}')\n"
+        "    print(name, *sorted(set(sys.argv[1].split()) & set(sys.modules)))"
+    )
+    modules = [name.replace("-", "_") for name in program.commands() if name != "sweep"]
+    printed = subprocess.run(
+        [sys.executable, "-c", code, " ".join(HEAVY), *modules], capture_output=True, text=True, check=True
+    )
+    assert printed.stdout.splitlines() == modules
 
 
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [(["--robto", "g1"], "--robot"), (["--iterations", "many"], "many"), (["--physics", "bullet"], "mjx-warp")],
 )
-def test_a_flag_that_is_none_is_told_with_what_would_be_one(arguments, told, capsys):
+def test_a_wrong_flag_is_refused_with_what_is_accepted(arguments, told, capsys):
     from forgetmimic_jax.train import Options
 
     with pytest.raises(SystemExit) as exit_:

@@ -4,12 +4,12 @@ import pytest
 import yaml
 
 from forgetmimic_jax.basics.errors import InputError
+from forgetmimic_jax.settings.checked import from_dict
 from forgetmimic_jax.settings.config import (
     Config,
     PPOConfig,
     UnlearnConfig,
     config_hash,
-    from_dict,
     load_config,
     preset,
     save_config,
@@ -101,24 +101,35 @@ def test_the_hash_does_not_see_how_long_or_how_often(name):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ({"pppo": {}}, "here: unknown setting 'pppo'; did you mean 'ppo'"),
-        ({"ppo": {"learning_rat": 1}}, "here: ppo: unknown setting 'learning_rat'; did you mean 'learning_rate'"),
-        ({"ppo": 3}, "here: ppo: expected a table of settings, found int"),
-        ([1], "here: expected a table of settings, found list"),
-        (None, "here: expected a table of settings, found NoneType"),
-        ({"seed": 1.5}, "here: seed: expected int, found 1.5"),
-        ({"seed": True}, "here: seed: expected int, found True"),
-        ({"ppo": {"clip": True}}, "here: ppo: clip: expected float, found True"),
-        ({"ppo": {"clip": "wide"}}, "here: ppo: clip: expected float, found 'wide'"),
-        ({"ppo": {"clip_value": 1}}, "here: ppo: clip_value: expected bool, found 1"),
-        ({"ppo": {"actor_layers": 256}}, "here: ppo: actor_layers: expected a list, found 256"),
-        ({"ppo": {"actor_layers": [256, "x"]}}, "here: ppo: actor_layers: expected int, found 'x'"),
+        ({"pppo": {}}, "here: no setting 'pppo'; did you mean 'ppo'?"),
+        ({"ppo": {"learning_rat": 1}}, "here: no setting 'ppo.learning_rat'; did you mean 'learning_rate'?"),
+        ({1: 2}, "here: no setting '1'; known: preset, robot, library, base, seed, iterations, "),
+        ({"ppo": 3}, "here: ppo: found 3; accepted: a table of settings"),
+        ([1], "here: found [1]; accepted: a table of settings"),
+        (None, "here: found None; accepted: a table of settings"),
+        ({"seed": 1.5}, "here: seed: found 1.5; accepted: a whole number from 0 to 4294967295"),
+        ({"seed": True}, "here: seed: found True; accepted: a whole number from 0 to 4294967295"),
+        ({"ppo": {"clip": True}}, "here: ppo.clip: found True; accepted: a number above 0"),
+        ({"ppo": {"clip": "1"}}, "here: ppo.clip: found '1'; accepted: a number above 0"),
+        ({"ppo": {"clip_value": 1}}, "here: ppo.clip_value: found 1; accepted: true or false"),
+        (
+            {"ppo": {"actor_layers": 256}},
+            "here: ppo.actor_layers: found 256; accepted: a list of: a whole number from 1",
+        ),
+        (
+            {"ppo": {"actor_layers": [256, "x"]}},
+            "here: ppo.actor_layers: found 'x'; accepted: a whole number from 1",
+        ),
         (
             {"ppo": {"schedule": "cosine"}},
-            "here: ppo: schedule: found 'cosine', accepted: adaptive, adaptive_iteration, fixed, trapezoid",
+            "here: ppo.schedule: found 'cosine'; accepted: adaptive, adaptive_iteration, fixed, trapezoid",
         ),
-        ({"unlearn": {"targets": "punch"}}, "here: unlearn: targets: expected a list, found 'punch'"),
-        ({"library": 5}, "here: library: expected str, found 5"),
+        ({"unlearn": {"targets": "punch"}}, "here: unlearn.targets: found 'punch'; accepted: a list of: text"),
+        ({"library": 5}, "here: library: found 5; accepted: text"),
+        (
+            {"noise": {"push_interval": [1.0]}},
+            "here: noise.push_interval: found [1.0]; accepted: a list of 2: a number from 0",
+        ),
     ],
 )
 def test_a_bad_setting_is_told_with_its_place_and_what_is_accepted(content, message):
@@ -141,7 +152,7 @@ def test_a_file_that_is_no_yaml_is_told_in_one_line(path):
 
 def test_an_empty_file_is_told(path):
     path.write_text("")
-    with pytest.raises(InputError, match="expected a table of settings"):
+    with pytest.raises(InputError, match="accepted: a table of settings"):
         load_config(path)
 
 
@@ -155,12 +166,12 @@ def test_the_file_is_plain_yaml(path):
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        (changed(epochs=0), "ppo.epochs: found 0; accepted: 1 or more"),
-        (changed(learning_rate=0.0), "ppo.learning_rate: found 0; accepted: above 0"),
-        (changed(learning_rate=float("nan")), "ppo.learning_rate: found nan; accepted: above 0"),
-        (changed(discount=1.01), "ppo.discount: found 1.01; accepted: 0 to 1"),
-        (changed(entropy_cost=-1.0), "ppo.entropy_cost: found -1; accepted: 0 or more"),
-        (changed(actor_layers=(8, 0)), "ppo.actor_layers: found 0; accepted: 1 or more"),
+        (changed(epochs=0), "ppo.epochs: found 0; accepted: a whole number from 1"),
+        (changed(learning_rate=0.0), "ppo.learning_rate: found 0.0; accepted: a number above 0"),
+        (changed(learning_rate=float("nan")), "ppo.learning_rate: found nan; accepted: a number above 0"),
+        (changed(discount=1.01), "ppo.discount: found 1.01; accepted: a number from 0 to 1"),
+        (changed(entropy_cost=-1.0), "ppo.entropy_cost: found -1.0; accepted: a number from 0"),
+        (changed(actor_layers=(8, 0)), "ppo.actor_layers: found 0; accepted: a whole number from 1"),
         (changed(num_envs=1, num_steps=2, minibatches=3), "ppo.minibatches: found 3; accepted: 1 to"),
         (changed(num_envs=6, branches=4), "ppo.branches: found 4; accepted: a divisor of num_envs = 6"),
         (
@@ -175,11 +186,14 @@ def test_the_file_is_plain_yaml(path):
             ),
             "sampling.target_share: found 0.5 with sampling.clips = kept; accepted: 0, or a share where",
         ),
-        (dataclasses.replace(Config(), seed=-1), "seed: found -1; accepted: 0 to 4294967295"),
-        (dataclasses.replace(Config(), evaluate_every=-1), "evaluate_every: found -1; accepted: 0 or more"),
+        (dataclasses.replace(Config(), seed=-1), "seed: found -1; accepted: a whole number from 0 to 4294967295"),
+        (
+            dataclasses.replace(Config(), evaluate_every=-1),
+            "evaluate_every: found -1; accepted: a whole number from 0",
+        ),
         (
             dataclasses.replace(Config(), reward=dataclasses.replace(Config().reward, survival=float("inf"))),
-            "reward.survival: found inf; accepted: any finite number",
+            "reward.survival: found inf; accepted: a finite number",
         ),
         (
             dataclasses.replace(Config(), reward=dataclasses.replace(Config().reward, foot_slip=-0.1)),
@@ -187,7 +201,7 @@ def test_the_file_is_plain_yaml(path):
         ),
         (
             dataclasses.replace(Config(), noise=dataclasses.replace(Config().noise, push_interval=(1.0,))),
-            "noise.push_interval: found 1 numbers; accepted: 2",
+            "noise.push_interval: found [1.0]; accepted: a list of 2: a number from 0",
         ),
     ],
 )

@@ -56,17 +56,18 @@ def test_no_settings_change_nothing():
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("seed", "--set seed: expected SECTION.NAME=VALUE"),
-        ("pppo.clip=1", "--set pppo.clip=1: no section 'pppo'"),
-        ("ppo.clip.x=1", "--set ppo.clip.x=1: no section 'clip'"),
-        ("robot.x=1", "--set robot.x=1: no section 'robot'"),
-        ("ppo.clipp=1", "--set: ppo: unknown setting 'clipp'; did you mean 'clip'"),
-        ("sed=1", "--set: unknown setting 'sed'; did you mean 'seed'"),
-        ("ppo=3", "--set: ppo: expected a table of settings"),
-        ("ppo.epochs=many", "--set: ppo: epochs: expected int, found 'many'"),
-        ("ppo.epochs=", "--set: ppo: epochs: expected int, found None"),
-        ("physics.engine=fast", "--set: physics: engine: found 'fast', accepted: auto, native, mjx, mjx-warp"),
-        ("ppo.actor_layers=[1", "--set ppo.actor_layers=[1: '[1' is no value"),
+        ("seed", "--set seed: accepted: SECTION.NAME=VALUE"),
+        ("pppo.clip=1", "--set: no setting 'pppo'; did you mean 'ppo'?"),
+        ("ppo.clip.x=1", "--set: ppo.clip: found {'x': 1}; accepted: a number above 0"),
+        ("robot.x=1", "--set: robot: found {'x': 1}; accepted: text"),
+        ("ppo.clipp=1", "--set: no setting 'ppo.clipp'; did you mean 'clip'?"),
+        ("sed=1", "--set: no setting 'sed'; did you mean 'seed'?"),
+        ("ppo=3", "--set: ppo: found 3; accepted: a table of settings"),
+        ("ppo.epochs=many", "--set: ppo.epochs: found 'many'; accepted: a whole number from 1"),
+        ("ppo.epochs=0", "--set: ppo.epochs: found 0; accepted: a whole number from 1"),
+        ("ppo.epochs=", "--set: ppo.epochs: found None; accepted: a whole number from 1"),
+        ("physics.engine=fast", "--set: physics.engine: found 'fast'; accepted: auto, native, mjx, mjx-warp"),
+        ("ppo.actor_layers=[1", "--set ppo.actor_layers=[1: found '[1'; accepted: a number, a word or [a, list]"),
     ],
 )
 def test_a_bad_setting_is_told_in_one_line(setting, message):
@@ -74,6 +75,11 @@ def test_a_bad_setting_is_told_in_one_line(setting, message):
         override(Config(), [setting])
     assert str(caught.value).startswith(message)
     assert "\n" not in str(caught.value)
+
+
+def test_a_bad_value_of_another_flag_does_not_name_set():
+    with pytest.raises(InputError, match=r"^seed: found -1; accepted: "):
+        override(dataclasses.replace(Config(), seed=-1), ["ppo.epochs=3"])
 
 
 def test_only_given_values_replace():

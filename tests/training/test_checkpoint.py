@@ -181,9 +181,7 @@ def test_an_unknown_setting_is_told_with_its_file(copy):
     settings = yaml.safe_load((copy / "config.yaml").read_text())
     settings["ppo"]["learning_rat"] = settings["ppo"].pop("learning_rate")
     (copy / "config.yaml").write_text(yaml.safe_dump(settings))
-    with pytest.raises(
-        InputError, match=r"config.yaml: ppo: unknown setting 'learning_rat'; did you mean 'learning_rate'\?"
-    ):
+    with pytest.raises(InputError, match=r"config.yaml: no setting 'ppo.learning_rat'; did you mean 'learning_rate'\?"):
         read_info(copy)
 
 
