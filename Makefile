@@ -67,7 +67,7 @@ experiments: .venv/.installed ## run what is missing of the paper's studies (hou
 	done; .venv/bin/python -m experiments.claims; exit $$status
 
 tables: .venv/.installed ## rewrite the README's tables and the studies' pages from the stored numbers alone
-	$(MODULE).evaluation.tables README.md
+	.venv/bin/python -m forgetmimic_jax.evaluation.tables README.md
 	@for study in $(STUDIES); do \
 		for robot in $(notdir $(wildcard robots/*)); do \
 			test ! -f experiments/results/$$robot/$$study.json || \
