@@ -39,7 +39,7 @@ STUDIES = validity comparison penalty heat_map motion_types physical_behaviour t
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help unlearn sweep experiments pretrain evaluate export play report video motions bench tables test lint format clean
+.PHONY: help unlearn sweep experiments pretrain evaluate export play report video motions bench tables test mutants lint format clean
 
 help: ## this list
 	@echo 'make TARGET [VARIABLE=value ...]'
@@ -101,6 +101,9 @@ tables: .venv/.installed ## rewrite the README's tables and the studies' pages f
 
 test: .venv/.installed ## run the tests
 	.venv/bin/python -m pytest $(ARGS)
+
+mutants: .venv/.installed ## see which faults of one line the tests notice (half an hour; ARGS=--list names them)
+	.venv/bin/python tests/mutants.py $(ARGS)
 
 lint: .venv/.installed ## check style, formatting and types
 	.venv/bin/ruff check .
