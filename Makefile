@@ -79,7 +79,7 @@ tables: .venv/.installed ## rewrite the README's tables and the studies' pages f
 test: .venv/.installed ## run the tests
 	.venv/bin/python -m pytest $(ARGS)
 
-mutants: .venv/.installed ## which one-line faults in a copy of the core the tests do not notice (some minutes)
+mutants: .venv/.installed ## see which faults of one line the tests notice (half an hour; ARGS=--list names them)
 	.venv/bin/python tests/mutants.py $(ARGS)
 
 lint: .venv/.installed ## check style, formatting and types

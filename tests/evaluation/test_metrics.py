@@ -28,6 +28,11 @@ def test_numbers_of_each_episode_by_hand():
     assert not any(name.endswith("_common") for name in numbers)
 
 
+def test_a_fall_in_the_last_step_is_no_success():
+    nearly = dataclasses.replace(two_episodes(), length=np.array([2, 2]))
+    np.testing.assert_array_equal(episode_metrics(nearly)["success_rate"], [0.0, 0.0])
+
+
 def test_errors_on_the_steps_that_every_policy_survives():
     first = two_episodes()
     second = dataclasses.replace(

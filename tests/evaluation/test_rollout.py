@@ -1,4 +1,5 @@
 import dataclasses
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from forgetmimic_jax.evaluation.rollout import CHUNK, Evaluator, episode_starts, evaluation_setup, step_errors
 from forgetmimic_jax.physics import BodyState
 from forgetmimic_jax.policy.policy import Policy, init_policy
+from forgetmimic_jax.tracking.env import EnvState
 from forgetmimic_jax.tracking.observation import actor_size
 from forgetmimic_jax.tracking.reference import align_to_anchor, lookup
 from forgetmimic_jax.tracking.reward import Pair
@@ -97,18 +99,57 @@ def test_a_policy_that_outputs_zero_is_the_zero_action(evaluator, zero_action, p
     np.testing.assert_allclose(rollout.tracking_reward, zero_action.tracking_reward, atol=1e-6)
 
 
-def test_every_policy_meets_the_same_starts(evaluator, zero_action, policy):
-    biased = jax.tree.map(lambda x: x + 0.1, policy.actor)
-    rollout = evaluator.rollout(dataclasses.replace(policy, actor=biased))
-    for field in ("clip", "start_frame", "horizon"):
-        np.testing.assert_array_equal(getattr(rollout, field), getattr(zero_action, field))
-    assert (rollout.tracking_reward != zero_action.tracking_reward).any()
+@pytest.fixture(scope="module")
+def echo(policy, robot) -> Callable[[float, float], Policy]:
+    """A policy that gives every joint `bias` plus `gain` times the last action of the first joint, if that was above 0.
+
+    Units of ELU are linear above 0, so one of each layer carries the last action through, and all else is zero.
+    """
+
+    def of(bias: float, gain: float) -> Policy:
+        actor = jax.tree.map(jnp.zeros_like, policy.actor)
+        first, middle, last = (actor["params"]["MLP_0"][f"Dense_{layer}"] for layer in range(3))
+        first["kernel"] = first["kernel"].at[-robot.num_joints, 0].set(1.0)
+        middle["kernel"] = middle["kernel"].at[0, 0].set(1.0)
+        last["kernel"] = last["kernel"].at[0].set(gain)
+        last["bias"] = jnp.full_like(last["bias"], bias)
+        return dataclasses.replace(policy, actor=actor)
+
+    return of
 
 
-def test_a_policy_changes_the_robot_only_after_its_first_action(evaluator):
-    begin = [evaluator.start() for _ in range(2)]
-    for one, two in zip(*(jax.tree.leaves(state) for state in begin), strict=True):
-        np.testing.assert_array_equal(one, two)
+def start_of(evaluator: Evaluator, policy: Policy | None) -> EnvState:
+    """The state in which the rollout of a policy begins; it ends right there."""
+    states = []
+
+    def advance(assets, policy, state):
+        states.append(jax.device_get(state))
+        ended = np.ones((CHUNK, 2 * EPISODES), bool)
+        return state, {"tracking_reward": np.zeros(ended.shape), "terminated": ended, "diverged": ~ended}
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(evaluator, "_advance", advance)
+        evaluator.rollout(policy)
+    return states[0]
+
+
+def test_every_policy_meets_the_same_starts_and_the_same_reset_noise(evaluator, library, echo):
+    first, *others = (start_of(evaluator, policy) for policy in (None, echo(0.1, 0.0), echo(-0.1, 0.5)))
+    for other in others:
+        for one, two in zip(jax.tree.leaves(first), jax.tree.leaves(other), strict=True):
+            np.testing.assert_array_equal(one, two)
+    noise = first.physics.qpos[:, 7:] - np.asarray(library.frames.joint_pos)[evaluator.clip, evaluator.start_frame]
+    assert 0.09 < np.abs(noise).max() <= 0.1 + 1e-6  # rad
+    assert len(np.unique(noise, axis=0)) == 2 * EPISODES  # episodes of one clip and frame too have each their own
+
+
+def test_a_policy_changes_the_robot_only_after_its_first_action(evaluator, echo):
+    """Two policies that agree in their first action and part in the second, beside one that never acts."""
+    still, steady, rising = (evaluator.rollout(echo(*policy)) for policy in ((0.0, 0.0), (0.2, 0.0), (0.2, 1.0)))
+    one, two, three = (rollout.errors["joint_velocity_error"] for rollout in (still, steady, rising))
+    np.testing.assert_allclose(three[:, 0], two[:, 0], rtol=1e-5)
+    assert (np.abs(two[:, 0] - one[:, 0]) > 1e-3).all()
+    assert (np.abs(three[:, 1] - two[:, 1]) > 1e-3).all()
 
 
 def scripted(evaluator: Evaluator, terminated: dict[int, list[int]], diverged: dict[int, list[int]]):

@@ -1,0 +1,398 @@
+"""Faults of one line, put into a copy of the code one at a time, to see that the tests named for each of them fail.
+
+`make mutants` runs all of them and ends with a table; ARGS='--only NAME ...' runs some, ARGS=--list names them. The
+exit code is 1 if a fault goes unnoticed, or if the line that it changes is no longer there. It is no part of
+`make test`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+
+class Mutant(NamedTuple):
+    """A fault: `old`, which occurs once in `file`, becomes `new`, and a test of the file `tests` is to fail."""
+
+    name: str
+    file: str
+    tests: str
+    breaks: str
+    old: str
+    new: str
+
+
+# fmt: off
+MUTANTS = (
+    # Credit: a step belongs to the episode that it ends, not to the one that starts after it.
+    Mutant("credit_clip", "forgetmimic_jax/ppo/collect.py", "tests/ppo/test_iteration.py",
+           "An episode's last step counts for the clip of the next episode.",
+           "clip=before.clip,",
+           "clip=fresh.clip,"),
+    Mutant("credit_reward", "forgetmimic_jax/ppo/collect.py", "tests/ppo/test_iteration.py",
+           "The anti-reward of an episode's last step follows the next episode's clip.",
+           "assets.is_target[before.clip], reward_key",
+           "assets.is_target[fresh.clip], reward_key"),
+    Mutant("credit_bin", "forgetmimic_jax/ppo/collect.py", "tests/ppo/test_iteration.py",
+           "An episode's failure is credited to the bin of the next one.",
+           "start_bin=before.start_bin,",
+           "start_bin=fresh.start_bin,"),
+    Mutant("credit_failure", "forgetmimic_jax/ppo/collect.py", "tests/ppo/test_iteration.py",
+           "An ended episode's failure is that of the new one: always 1.",
+           "after.tracking_sum, after.step, after.horizon",
+           "fresh.tracking_sum, fresh.step, fresh.horizon"),
+    Mutant("credit_steps", "forgetmimic_jax/ppo/collect.py", "tests/ppo/test_iteration.py",
+           "An ended episode's length is that of the new one: always 0.",
+           "steps=after.step,",
+           "steps=fresh.step,"),
+    # Starts.
+    Mutant("target_share", "forgetmimic_jax/ppo/collect.py", "tests/ppo/test_iteration.py",
+           "A rollout's episodes start without the targets' share.",
+           "state.failure_level, assets.is_target)\n    gains",
+           "state.failure_level)\n    gains"),
+    Mutant("edit_noise", "forgetmimic_jax/ppo/collect.py", "tests/ppo/test_iteration.py",
+           "States drawn without a simulator have the same reset noise in every batch.",
+           "start_episodes(env, assets, episode_key, clip",
+           "start_episodes(env, assets, draw_key, clip"),
+    Mutant("reset_noise", "forgetmimic_jax/evaluation/rollout.py", "tests/evaluation/test_rollout.py",
+           "Every rollout of an evaluation has other reset noise.",
+           "self._begin(self._assets, jax.random.PRNGKey(self._seed))",
+           "self._begin(self._assets, jax.random.PRNGKey(np.random.randint(1000)))"),
+    Mutant("reset_turn", "forgetmimic_jax/tracking/randomise.py", "tests/tracking/test_randomise.py",
+           "Reset noise turns the base about its own axes, not the world's.",
+           "rotation.multiply(turn, reference.bodies.quat[:, root])",
+           "rotation.multiply(reference.bodies.quat[:, root], turn)"),
+    Mutant("failure_signal", "forgetmimic_jax/tracking/rsi.py", "tests/tracking/test_rsi.py",
+           "An early death no longer counts as failure.",
+           'divisor = horizon if config.failure_signal == "survival_weighted" else steps',
+           "divisor = steps"),
+    Mutant("failure_average", "forgetmimic_jax/tracking/rsi.py", "tests/tracking/test_rsi.py",
+           "Failure levels are averaged once an iteration, not once an episode.",
+           "keep = (1.0 - config.smoothing) ** count",
+           "keep = 1.0 - config.smoothing"),
+    Mutant("sampler_prior", "forgetmimic_jax/tracking/rsi.py", "tests/tracking/test_rsi.py",
+           "The uniform part of the adaptive sampler favours clips of many bins.",
+           "+ config.uniform_ratio * prior",
+           "+ config.uniform_ratio * bins.valid / count"),
+    # Advantages and branches.
+    Mutant("gae_termination", "forgetmimic_jax/ppo/gae.py", "tests/ppo/test_gae.py",
+           "A fall keeps the value of what would have followed.",
+           "jnp.where(terminated, 0.0, next_value)",
+           "next_value"),
+    Mutant("gae_truncation", "forgetmimic_jax/ppo/gae.py", "tests/ppo/test_gae.py",
+           "The advantage of the next episode leaks into one that its time ended.",
+           "carry_on = 1.0 - (terminated | truncated)",
+           "carry_on = 1.0 - terminated"),
+    Mutant("gae_order", "forgetmimic_jax/ppo/update.py", "tests/ppo/test_iteration.py",
+           "Falls are treated as the end of the clip, and the end of the clip as a fall.",
+           "outcome.terminated,\n        outcome.truncated,",
+           "outcome.truncated,\n        outcome.terminated,"),
+    Mutant("branches_used", "forgetmimic_jax/ppo/update.py", "tests/ppo/test_iteration.py",
+           "Branches start together but are never compared.",
+           "if config.branches > 1:",
+           "if config.branches > 1000:"),
+    Mutant("branches_value", "forgetmimic_jax/ppo/update.py", "tests/ppo/test_iteration.py",
+           "The critic learns the difference of branches, not what came.",
+           "return advantage, value_target",
+           "return advantage, advantage + outcome.value"),
+    Mutant("branches_own", "forgetmimic_jax/ppo/gae.py", "tests/ppo/test_gae.py",
+           "A branch is part of its own baseline.",
+           ".sum(-1, keepdims=True) - grouped) / jnp.maximum(others, 1)",
+           ".sum(-1, keepdims=True)) / jnp.maximum(others + 1, 1)"),
+    Mutant("branches_ended", "forgetmimic_jax/ppo/gae.py", "tests/ppo/test_gae.py",
+           "A branch leaves the comparison one step too early.",
+           "(jnp.cumsum(done, axis=0) - done) == 0",
+           "jnp.cumsum(done, axis=0) == 0"),
+    # Losses and methods.
+    Mutant("penalty_sign", "forgetmimic_jax/unlearning/arft.py", "tests/unlearning/test_arft.py",
+           "The anti-reward pays for tracking the targets.",
+           "- config.unlearn.penalty *",
+           "+ config.unlearn.penalty *"),
+    Mutant("kl", "forgetmimic_jax/policy/gaussian.py", "tests/policy/test_network.py",
+           "The divergence of two Gaussians has their variances the wrong way round.",
+           "variance_ratio = jnp.exp(2.0 * (log_std - new_log_std))",
+           "variance_ratio = jnp.exp(2.0 * (new_log_std - log_std))"),
+    Mutant("kl_anchor", "forgetmimic_jax/ppo/loss.py", "tests/unlearning/test_methods.py",
+           "The anchor is the base's divergence from the policy.",
+           "kl_divergence(now.mean, now.log_std, batch.base.mean, batch.base.log_std)",
+           "kl_divergence(batch.base.mean, batch.base.log_std, now.mean, now.log_std)"),
+    Mutant("anchor_mask", "forgetmimic_jax/ppo/loss.py", "tests/unlearning/test_methods.py",
+           "The anchor holds the policy to the base on the targets too.",
+           "mean(away, batch.weight * ~batch.is_target)",
+           "mean(away, batch.weight)"),
+    Mutant("kl_decremental", "forgetmimic_jax/unlearning/decremental.py", "tests/unlearning/test_methods.py",
+           "Decremental unlearning keeps by the reversed divergence.",
+           "keep = kl_divergence(now.mean, now.log_std, base.mean, base.log_std)",
+           "keep = kl_divergence(base.mean, base.log_std, now.mean, now.log_std)"),
+    Mutant("kl_policy_edit", "forgetmimic_jax/unlearning/policy_edit.py", "tests/unlearning/test_methods.py",
+           "Policy editing keeps by the reversed divergence.",
+           "keep = kl_divergence(now.mean, now.log_std, base.mean, base.log_std)",
+           "keep = kl_divergence(base.mean, base.log_std, now.mean, now.log_std)"),
+    Mutant("base_actor", "forgetmimic_jax/ppo/update.py", "tests/ppo/test_iteration.py",
+           "The base's actor reads observations through the learner's normaliser.",
+           "batch = make_batch(env.config, assets, transition, outcome.value",
+           "learners = assets.base and assets.base.replace(actor_normalizer=state.policy.actor_normalizer)\n"
+           "        batch = make_batch(env.config, assets.replace(base=learners), transition, outcome.value"),
+    Mutant("base_critic", "forgetmimic_jax/ppo/update.py", "tests/ppo/test_iteration.py",
+           "The base's critic reads observations through the learner's normaliser.",
+           "batch = make_batch(env.config, assets, transition, outcome.value",
+           "learners = assets.base and assets.base.replace(critic_normalizer=state.policy.critic_normalizer)\n"
+           "        batch = make_batch(env.config, assets.replace(base=learners), transition, outcome.value"),
+    # The step of the environment.
+    Mutant("time_reward", "forgetmimic_jax/tracking/env.py", "tests/tracking/test_env.py",
+           "A step is compared with the frame that it left, and its PD targets are that frame's.",
+           "state.frame + 1)\n    # The joint",
+           "state.frame)\n    # The joint"),
+    Mutant("time_observation", "forgetmimic_jax/tracking/env.py", "tests/tracking/test_env.py",
+           "The policy sees the frame where it is, not the one that it is to reach.",
+           "state.frame + 1)\n    clean",
+           "state.frame)\n    clean"),
+    Mutant("encoder_bias", "forgetmimic_jax/tracking/env.py", "tests/tracking/test_env.py",
+           "The encoders' bias moves the robot the wrong way.",
+           "assets.robot.action_scale * action - state.encoder_bias",
+           "assets.robot.action_scale * action + state.encoder_bias"),
+    Mutant("acceleration", "forgetmimic_jax/tracking/env.py", "tests/tracking/test_env.py",
+           "The joints' acceleration is that of the step before.",
+           "joint_acc=physics.warmstart[:, 6:],",
+           "joint_acc=state.physics.warmstart[:, 6:],"),
+    Mutant("action_rate", "forgetmimic_jax/tracking/env.py", "tests/tracking/test_env.py",
+           "The action rate compares an action with itself.",
+           "last_action=state.last_action,",
+           "last_action=action,"),
+    Mutant("torque", "forgetmimic_jax/tracking/env.py", "tests/tracking/test_env.py",
+           "The torque's cost leaves out what the action asks for.",
+           "target=target,",
+           "target=reference.joint_pos,"),
+    Mutant("last_step", "forgetmimic_jax/tracking/env.py", "tests/tracking/test_env.py",
+           "A fall in the last step also counts as the clip's end.",
+           "truncated = (steps >= state.horizon) & ~terminated",
+           "truncated = steps >= state.horizon"),
+    Mutant("wrench_time", "forgetmimic_jax/tracking/env.py", "tests/tracking/test_env.py",
+           "The wrench pulls towards the frame where the control step began.",
+           "wrench = assist(env, assets, state, fraction)",
+           "wrench = assist(env, assets, state)"),
+    Mutant("wrench_weight", "forgetmimic_jax/tracking/wrench.py", "tests/tracking/test_wrench.py",
+           "The wrench pushes the robot down by its weight.",
+           "- robot.gravity)",
+           "+ robot.gravity)"),
+    # Conventions of orientations.
+    Mutant("quaternion_w", "forgetmimic_jax/basics/rotation.py", "tests/basics/test_rotation.py",
+           "First row of the product.",
+           "aw * bw - ax * bx - ay * by - az * bz",
+           "aw * bw + ax * bx - ay * by - az * bz"),
+    Mutant("quaternion_x", "forgetmimic_jax/basics/rotation.py", "tests/basics/test_rotation.py",
+           "Second row of the product.",
+           "aw * bx + ax * bw + ay * bz - az * by",
+           "aw * bx + ax * bw - ay * bz + az * by"),
+    Mutant("quaternion_y", "forgetmimic_jax/basics/rotation.py", "tests/basics/test_rotation.py",
+           "Third row of the product.",
+           "aw * by - ax * bz + ay * bw + az * bx",
+           "aw * by + ax * bz + ay * bw - az * bx"),
+    Mutant("quaternion_z", "forgetmimic_jax/basics/rotation.py", "tests/basics/test_rotation.py",
+           "Fourth row of the product.",
+           "aw * bz + ax * by - ay * bx + az * bw",
+           "aw * bz - ax * by + ay * bx + az * bw"),
+    Mutant("rotate_direction", "forgetmimic_jax/basics/rotation.py", "tests/basics/test_rotation.py",
+           "Vectors turn the other way: world to body instead of body to world.",
+           "return vector + w * t + jnp.cross(xyz, t)",
+           "return vector - w * t + jnp.cross(xyz, t)"),
+    Mutant("observation_frame", "forgetmimic_jax/tracking/observation.py", "tests/tracking/test_observation.py",
+           "The reference's velocity is shown in the world's axes.",
+           "rotation.rotate_inverse(ref_quat, reference.bodies.lin_vel[:, root])",
+           "reference.bodies.lin_vel[:, root]"),
+    Mutant("align_height", "forgetmimic_jax/tracking/reference.py", "tests/tracking/test_reward.py",
+           "Errors of height are aligned away.",
+           "jnp.concatenate([anchor_pos[:, :2], ref_pos[:, 2:]], axis=-1)",
+           "anchor_pos"),
+    # Evaluation.
+    Mutant("success", "forgetmimic_jax/evaluation/metrics.py", "tests/evaluation/test_metrics.py",
+           "A fall in the last step is a success.",
+           "(rollout.length == rollout.horizon)",
+           "(rollout.length >= rollout.horizon - 1)"),
+    Mutant("survival_weight", "forgetmimic_jax/evaluation/metrics.py", "tests/evaluation/test_metrics.py",
+           "What a policy misses after a fall costs nothing.",
+           '"survival_weighted_tracking": tracked / rollout.horizon',
+           '"survival_weighted_tracking": tracked / rollout.length'),
+    Mutant("rate_interval", "forgetmimic_jax/evaluation/statistics.py", "tests/evaluation/test_statistics.py",
+           "The interval of a success rate is an approximation.",
+           'method="exact"',
+           'method="wilson"'),
+    Mutant("strata", "forgetmimic_jax/evaluation/statistics.py", "tests/evaluation/test_statistics.py",
+           "The bootstrap no longer keeps each clip's share.",
+           "members = np.flatnonzero(strata == stratum)",
+           "members = np.arange(len(strata))"),
+    Mutant("strata_size", "forgetmimic_jax/evaluation/statistics.py", "tests/evaluation/test_statistics.py",
+           "Resamples weigh less than the sample.",
+           "* (n / (n - 1.0))",
+           ""),
+    Mutant("verdict_lost_clip", "forgetmimic_jax/evaluation/verdict.py", "tests/evaluation/test_verdict.py",
+           "A kept clip that was lost hides in the mean of the others.",
+           'if skill["high"] < KEPT_CLIP:',
+           'if skill["high"] < -1.0:'),
+    Mutant("verdict_target", "forgetmimic_jax/evaluation/verdict.py", "tests/evaluation/test_verdict.py",
+           "A target counts as forgotten although its interval goes beyond the bound.",
+           'elif skill["high"] > FORGOTTEN:',
+           'elif skill["mean"] > FORGOTTEN:'),
+    Mutant("verdict_negative", "forgetmimic_jax/evaluation/verdict.py", "tests/evaluation/test_verdict.py",
+           "A negative skill on one clip pays for another.",
+           "sum(max(0.0, of[end]) for of in skill.values())",
+           "sum(of[end] for of in skill.values())"),
+    # Studies.
+    Mutant("membership_twins", "experiments/membership.py", "tests/commands/test_studies.py",
+           "Clips and their mirror images are exchanged.",
+           "features(rollout, twins[key])",
+           "features(twins[key], rollout)"),
+    Mutant("membership_asked", "experiments/membership.py", "tests/commands/test_studies.py",
+           "The attack learns on the targets and is asked about the kept clips.",
+           "for mask in (~is_target, is_target))",
+           "for mask in (is_target, ~is_target))"),
+    Mutant("relearning_base", "experiments/relearning.py", "tests/commands/test_studies.py",
+           "Relearning is measured against the unlearned policy, not the base.",
+           '_tracking(at_first["base"], lab.targets)',
+           '_tracking(at_first["unlearned"], lab.targets)'),
+    Mutant("relearning_clips", "experiments/relearning.py", "tests/commands/test_studies.py",
+           "Relearning starts from kept clips only.",
+           'watched = {"clips": "all", ',
+           'watched = {"clips": "kept", '),
+    Mutant("relearning_anchor", "experiments/relearning.py", "tests/commands/test_studies.py",
+           "Relearning is held to the policy that it starts from.",
+           '"schedule": "fixed", "anchor": 0.0}',
+           '"schedule": "fixed"}'),
+)
+# fmt: on
+
+TIME_LIMIT = 600  # s for the tests of one mutant
+ROOT = Path(__file__).resolve().parents[1]
+LEFT_OUT = shutil.ignore_patterns(".*", "runs", "build", "__pycache__", "*.egg-info")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The command; returns its exit code."""
+    parser = argparse.ArgumentParser(prog="make mutants", description="See which faults of one line the tests notice.")
+    parser.add_argument("--list", action="store_true", help="name the mutants, and those that no longer fit the code")
+    parser.add_argument("--only", nargs="+", metavar="NAME", help="try these alone")
+    asked = parser.parse_args(arguments)
+    by_name = {mutant.name: mutant for mutant in MUTANTS}
+    for name in asked.only or ():
+        if name not in by_name:
+            parser.error(f"no mutant '{name}'; --list names them")
+    chosen = [by_name[name] for name in asked.only or by_name]
+    console = Console()
+    if asked.list:
+        outdated = {mutant: told for mutant in chosen if (told := misfit(mutant, ROOT))}
+        console.print(table({mutant: outdated.get(mutant, "") for mutant in chosen}))
+        return 1 if outdated else 0
+    with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
+        tree = Path(folder) / "copy"
+        shutil.copytree(ROOT, tree, ignore=LEFT_OUT)
+        unnoticed = try_all(chosen, tree, console)
+    console.print(f"{len(chosen) - len(unnoticed)} of {len(chosen)} mutants were noticed")
+    if unnoticed:
+        console.print(table(unnoticed))
+    return 1 if unnoticed else 0
+
+
+def try_all(chosen: list[Mutant], tree: Path, console: Console) -> dict[Mutant, str]:
+    """Each mutant in a copy of the working tree; returns those that no test noticed, and what happened instead."""
+    columns = (TextColumn("{task.description}"), BarColumn(bar_width=20), MofNCompleteColumn())
+    times = (TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(compact=True))
+    unnoticed = {}
+    fails_anyway: dict[str, bool] = {}
+    with Progress(*columns, *times, console=console) as bar:
+        task = bar.add_task("", total=len(chosen))
+        for mutant in chosen:
+            bar.update(task, description=mutant.name)
+            begin = time.monotonic()
+            problem, killer = misfit(mutant, tree), ""
+            if not problem:
+                if mutant.tests not in fails_anyway:
+                    fails_anyway[mutant.tests] = run_tests(tree, mutant.tests)[0] != 0
+                if fails_anyway[mutant.tests]:
+                    problem = f"{mutant.tests} fails without a mutant too"
+                else:
+                    problem, killer = try_one(mutant, tree)
+            if problem:
+                unnoticed[mutant] = problem
+            told = f"{time.monotonic() - begin:4.0f} s  {mutant.name}: {problem or killer}"
+            console.print(told, markup=False, highlight=False, soft_wrap=True)
+            bar.advance(task)
+    return unnoticed
+
+
+def try_one(mutant: Mutant, tree: Path) -> tuple[str, str]:
+    """Puts the mutant into the tree for as long as its tests run; returns what went wrong or '', and the failing test.
+
+    Only a test that fails notices a mutant: one that breaks an import, or never ends, shows nothing.
+    """
+    path = tree / mutant.file
+    text = path.read_text()
+    path.write_text(text.replace(mutant.old, mutant.new))
+    try:
+        code, output = run_tests(tree, mutant.tests)
+    finally:
+        path.write_text(text)
+    if code == 0:
+        return "SURVIVED", ""
+    if code is None:
+        return f"no result within {TIME_LIMIT} s", ""
+    failed = re.search(r"^(?:FAILED|ERROR) \S+?::(\S+)", output, re.MULTILINE)
+    if code != 1 or failed is None:
+        return "the tests could not run: " + output.strip().split("\n")[-1], ""
+    return "", failed[1]
+
+
+def misfit(mutant: Mutant, tree: Path) -> str:
+    """Why the mutant does not fit the code, or ''."""
+    for name in (mutant.file, mutant.tests):
+        if not (tree / name).exists():
+            return f"no file {name}"
+    count = (tree / mutant.file).read_text().count(mutant.old)
+    return "" if count == 1 else f"its text occurs {count} times in {mutant.file}, not once"
+
+
+def run_tests(tree: Path, tests: str) -> tuple[int | None, str]:
+    """Exit code and output of pytest, which stops at the first failure; None where it ran out of time."""
+    options = ["-x", "-q", "--tb=no", "-rfE", "-p", "no:cacheprovider"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "pytest", *options, tests],
+        cwd=tree,
+        env={**os.environ, "PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+    try:
+        output, _ = process.communicate(timeout=TIME_LIMIT)
+        return process.returncode, output
+    except subprocess.TimeoutExpired:
+        return None, ""
+    finally:
+        if process.poll() is None:  # out of time, or interrupted: it ends with all that it started
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+def table(rows: dict[Mutant, str]) -> Table:
+    """Mutants, what each breaks, and what is to be said of it."""
+    result = Table("mutant", "what it breaks", "tests", "", box=None, header_style="bold")
+    for mutant, told in rows.items():
+        result.add_row(mutant.name, mutant.breaks, Path(mutant.tests).name, told)
+    return result
+
+
+if __name__ == "__main__":
+    sys.exit(main())
