@@ -43,8 +43,9 @@ def main(options: Options) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from forgetmimic_jax.physics.engine import resolve_engine
+    from forgetmimic_jax.physics.choose import resolve_engine
     from forgetmimic_jax.ppo.collect import collect
+    from forgetmimic_jax.ppo.rule import Rule
     from forgetmimic_jax.ppo.update import make_iteration
     from forgetmimic_jax.settings.config import preset
     from forgetmimic_jax.tracking import env as tracking
@@ -67,7 +68,7 @@ def main(options: Options) -> None:
         config.ppo.num_steps,
     )
     state = start_state(setup, env, assets)
-    first_iteration = make_iteration(env)
+    first_iteration = make_iteration(env, Rule())
     state, _ = jax.block_until_ready(first_iteration(assets, state))
     to_first_step = time.perf_counter() - started
     probabilities = bin_probabilities(config.sampling, assets.bins, state.failure_level, assets.is_target)
@@ -88,7 +89,7 @@ def main(options: Options) -> None:
 
         return jax.lax.scan(one_step, episodes, jax.random.split(key, steps))
 
-    collect_only = jax.jit(lambda assets, state: collect(env, assets, state))
+    collect_only = jax.jit(lambda assets, state: collect(env, assets, state, Rule()))
     _, (physics, targets, *_) = jax.block_until_ready(environment(assets, state.env, jax.random.PRNGKey(1)))
     jax.block_until_ready(collect_only(assets, state))
     raw = _raw_stepping(setup.robot.model, env.num_envs, config.physics.substeps, physics, targets)

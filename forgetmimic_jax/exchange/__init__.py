@@ -1,1 +1,4 @@
-"""Policies in other projects' formats: ONNX out and in, rsl_rl in, and an ONNX policy at work in plain MuJoCo."""
+"""Policies that come from other projects or go to a robot: ONNX, rsl_rl, and the closed loop in plain MuJoCo.
+
+The project's own checkpoints are in `training`.
+"""

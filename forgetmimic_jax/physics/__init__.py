@@ -1,5 +1,8 @@
-"""Physics behind one protocol, with two engines: MuJoCo's own C engine and MJX."""
+"""Simulation behind one protocol, with two engines: MuJoCo's own C engine and MJX.
 
-from forgetmimic_jax.physics.engine import BodyState, Engine, PhysicsParameters, PhysicsState, make_engine
+What a robot is to do is in `tracking`; the robot itself is in `robot`.
+"""
 
-__all__ = ["BodyState", "Engine", "PhysicsParameters", "PhysicsState", "make_engine"]
+from forgetmimic_jax.physics.engine import BodyState, Engine, PhysicsParameters, PhysicsState
+
+__all__ = ["BodyState", "Engine", "PhysicsParameters", "PhysicsState"]

@@ -5,7 +5,7 @@ An engine is stateless: what goes in decides what comes out, so a rollout can be
 
 from __future__ import annotations
 
-from typing import Literal, Protocol
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,6 @@ from jax import Array
 from forgetmimic_jax.basics import rotation
 from forgetmimic_jax.robot.bodies import Bodies
 from forgetmimic_jax.robot.model import CONTACT_SENSOR, Robot
-from forgetmimic_jax.settings.config import PhysicsConfig
 
 
 @struct.dataclass
@@ -96,22 +95,3 @@ def contact_sensor_columns(robot: Robot) -> np.ndarray:
     """
     first = [int(robot.model.sensor(CONTACT_SENSOR + body).adr[0]) for body in robot.key_bodies]
     return np.array(first)[:, None] + np.arange(3)
-
-
-def resolve_engine(name: Literal["auto", "native", "mjx", "mjx-warp"]) -> str:
-    """`auto` becomes native on a CPU and mjx on a GPU or TPU."""
-    if name != "auto":
-        return name
-    return "native" if jax.default_backend() == "cpu" else "mjx"
-
-
-def make_engine(robot: Robot, config: PhysicsConfig, num_envs: int) -> Engine:
-    """The engine that `config.engine` names, for a batch of `num_envs` robots."""
-    name = resolve_engine(config.engine)
-    if name == "native":
-        from forgetmimic_jax.physics.native import NativeEngine
-
-        return NativeEngine(robot, config.substeps, num_envs)
-    from forgetmimic_jax.physics.mjx import MjxEngine
-
-    return MjxEngine(robot, config.substeps, implementation="warp" if name == "mjx-warp" else "jax")

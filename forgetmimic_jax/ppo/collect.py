@@ -9,27 +9,27 @@ import jax.numpy as jnp
 from jax import Array
 
 from forgetmimic_jax.policy.gaussian import log_prob
+from forgetmimic_jax.ppo.rule import Rule
 from forgetmimic_jax.ppo.state import TrainState
 from forgetmimic_jax.ppo.transition import Outcome, Transition
 from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.tracking.env import Assets, Environment
 from forgetmimic_jax.tracking.rsi import bin_probabilities, episode_failure, sample_start
 from forgetmimic_jax.tracking.wrench import wrench_gain
-from forgetmimic_jax.unlearning.registry import method_of
 
 
-def collect(env: Environment, assets: Assets, state: TrainState) -> tuple[TrainState, Transition, Outcome]:
+def collect(env: Environment, assets: Assets, state: TrainState, rule: Rule) -> tuple[TrainState, Transition, Outcome]:
     """`num_steps` control steps of every environment with the current policy.
 
     With `branches`, every group of environments starts from the state of its first one.
     """
-    config, policy, method = env.config, state.policy, method_of(env.config)
+    config, policy = env.config, state.policy
     probabilities = bin_probabilities(config.sampling, assets.bins, state.failure_level, assets.is_target)
     gains = wrench_gain(config.wrench, state.failure_level)
 
     def observe(episodes: tracking.EnvState, key: Array) -> tuple[Array, Array]:
         actor_obs, critic_obs = tracking.observe(env, assets, episodes, key if env.noisy else None)
-        return method.observation(actor_obs, assets.is_target[episodes.clip]), critic_obs
+        return rule.observation(actor_obs, assets.is_target[episodes.clip]), critic_obs
 
     def one_step(carry, key: Array):
         before, actor_obs, critic_obs = carry
@@ -42,7 +42,7 @@ def collect(env: Environment, assets: Assets, state: TrainState) -> tuple[TrainS
         )
         last_critic_obs = tracking.observe(env, assets, after, None)[1]
         reward_key = jax.random.fold_in(key, 4)  # none of the four above
-        reward = method.reward(config, result.reward, assets.is_target[before.clip], reward_key)
+        reward = rule.reward(config, result.reward, assets.is_target[before.clip], reward_key)
         transition = Transition(
             actor_observation=actor_obs,
             critic_observation=critic_obs,

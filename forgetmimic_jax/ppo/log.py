@@ -7,11 +7,11 @@ import jax.numpy as jnp
 from jax import Array
 
 from forgetmimic_jax.ppo.state import TrainState
+from forgetmimic_jax.ppo.threshold import threshold_metrics
 from forgetmimic_jax.ppo.transition import Outcome
 from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking.env import Assets
 from forgetmimic_jax.tracking.rsi import bin_probabilities
-from forgetmimic_jax.unlearning.threshold import threshold_metrics
 
 
 def rollout_metrics(

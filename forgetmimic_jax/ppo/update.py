@@ -1,6 +1,6 @@
 """One PPO iteration: collect, advantages, epochs, sampler. A pure function of the TrainState, jitted once.
 
-An unlearning method replaces the rules that it names (`unlearning.method.Method`); all else is the same program.
+A rule (`ppo.rule.Rule`), such as an unlearning method's, replaces the parts that it names; all else is the same.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from forgetmimic_jax.ppo.collect import collect, draw_states
 from forgetmimic_jax.ppo.gae import centre_branches, generalized_advantages
 from forgetmimic_jax.ppo.log import rollout_metrics
 from forgetmimic_jax.ppo.loss import Batch, Prediction, adapt_learning_rate, equal_share, trapezoid
+from forgetmimic_jax.ppo.rule import Rule
 from forgetmimic_jax.ppo.state import TrainState, make_optimizer
 from forgetmimic_jax.ppo.transition import Outcome, Transition
 from forgetmimic_jax.settings.config import Config, PPOConfig
 from forgetmimic_jax.tracking.env import Assets, Environment
 from forgetmimic_jax.tracking.rsi import update_failure_level
-from forgetmimic_jax.unlearning.registry import method_of
 
 Metrics = dict[str, Array]
 
 
-def make_iteration(env: Environment) -> Callable[[Assets, TrainState], tuple[TrainState, Metrics]]:
-    """The jitted iteration(assets, state) → (state, metrics); the state is donated."""
+def make_iteration(env: Environment, rule: Rule) -> Callable[[Assets, TrainState], tuple[TrainState, Metrics]]:
+    """The jitted iteration(assets, state) → (state, metrics) under a training rule; the state is donated."""
 
     def on_rollout(assets: Assets, state: TrainState) -> tuple[TrainState, Metrics]:
-        state, transition, outcome = collect(env, assets, state)
+        state, transition, outcome = collect(env, assets, state, rule)
         advantage, value_target = advantages(env.config.ppo, outcome)
         batch = make_batch(env.config, assets, transition, outcome.value, advantage, value_target)
-        state, losses = improve(env.config, state, batch)
+        state, losses = improve(env.config, state, batch, rule)
         state = learn_normalizers(state, transition)
         state = learn_sampler(env.config, state, transition.clip, outcome)
         metrics = losses | rollout_metrics(env.config, assets, state, transition.clip, outcome)
@@ -46,11 +46,11 @@ def make_iteration(env: Environment) -> Callable[[Assets, TrainState], tuple[Tra
         state, transition = draw_states(env, assets, state)
         nothing = jnp.zeros(transition.clip.shape, jnp.float32)
         batch = make_batch(env.config, assets, transition, nothing, nothing, nothing)
-        state, losses = improve(env.config, state, batch)
+        state, losses = improve(env.config, state, batch, rule)
         metrics = losses | rollout_metrics(env.config, assets, state, transition.clip, None)
         return dataclasses.replace(state, iteration=state.iteration + 1), metrics
 
-    return jax.jit(on_rollout if method_of(env.config).simulate else on_drawn_states, donate_argnums=1)
+    return jax.jit(on_rollout if rule.simulate else on_drawn_states, donate_argnums=1)
 
 
 def advantages(config: PPOConfig, outcome: Outcome) -> tuple[Array, Array]:
@@ -97,15 +97,15 @@ def _at_every_step(prediction: Prediction) -> Prediction:
     return dataclasses.replace(prediction, log_std=jnp.broadcast_to(prediction.log_std, prediction.mean.shape))
 
 
-def improve(run: Config, state: TrainState, batch: Batch) -> tuple[TrainState, Metrics]:
+def improve(run: Config, state: TrainState, batch: Batch, rule: Rule) -> tuple[TrainState, Metrics]:
     """Epochs of mini-batch gradient steps."""
-    config, policy, method = run.ppo, state.policy, method_of(run)
+    config, policy = run.ppo, state.policy
     optimizer = make_optimizer(config)
     size = len(batch.value)
 
     def loss_of(parameters, data: Batch) -> tuple[Array, Metrics]:
         now = predict(policy.with_parameters(parameters), data.transition)
-        loss, metrics = method.loss(run, data, now, state.iteration)
+        loss, metrics = rule.loss(run, data, now, state.iteration)
         return loss, metrics | {"kl": kl_divergence(data.transition.mean, policy.log_std, now.mean, now.log_std).mean()}
 
     def adapt(learning_rate: Array, kl: Array) -> Array:

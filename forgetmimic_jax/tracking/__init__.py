@@ -1,1 +1,4 @@
-"""The tracking task: reference, observation, reward, termination, sampling, wrench, randomisation, environment."""
+"""The tracking task: reference, observation, reward, termination, starts, wrench, randomisation, environment.
+
+How a policy learns it is in `ppo`; how clips become a library is in `motion`.
+"""

@@ -16,7 +16,8 @@ from flax import struct
 from jax import Array
 
 from forgetmimic_jax.motion.library import MotionLibrary
-from forgetmimic_jax.physics import BodyState, Engine, PhysicsParameters, PhysicsState, make_engine
+from forgetmimic_jax.physics import BodyState, Engine, PhysicsParameters, PhysicsState
+from forgetmimic_jax.physics.choose import make_engine
 from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.robot.model import Robot, RobotArrays
 from forgetmimic_jax.settings.config import Config

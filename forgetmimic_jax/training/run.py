@@ -25,6 +25,7 @@ from forgetmimic_jax.training.log import Log
 from forgetmimic_jax.training.signals import stop_requests
 from forgetmimic_jax.training.start import base_checkpoint, saved_state, start_state, steps_before
 from forgetmimic_jax.training.watch import Watch
+from forgetmimic_jax.unlearning.registry import method_of
 
 KEEP = 2  # newest checkpoints kept beside the named ones
 LOG_EVERY = 10  # iterations averaged into one row of metrics.jsonl; the first has a row of its own
@@ -48,7 +49,7 @@ def run(setup: Setup, directory: Path, *, description: str, resume: bool = False
     else:
         state, environment_steps = saved_state(setup, env, assets, newest)
     iteration = int(state.iteration)
-    iterate = make_iteration(env)
+    iterate = make_iteration(env, method_of(config))
     directory.mkdir(parents=True, exist_ok=True)
     console = Console()
     saved = newest

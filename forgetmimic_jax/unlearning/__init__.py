@@ -1,1 +1,4 @@
-"""Unlearning methods: one module each, a small bundle of pure functions that says where it differs from PPO."""
+"""The unlearning methods: one module each, which says where its rule differs from PPO.
+
+A file that is put here is a method; the iteration that they share is in `ppo`.
+"""

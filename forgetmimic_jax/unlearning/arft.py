@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from jax import Array
 
+from forgetmimic_jax.ppo.rule import plain_reward
 from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking.reward import Reward
-from forgetmimic_jax.unlearning.method import Method, plain_reward
+from forgetmimic_jax.unlearning.method import Method
 
 
 def anti_reward(config: Config, reward: Reward, is_target: Array, key: Array) -> Array:

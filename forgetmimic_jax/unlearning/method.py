@@ -2,25 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from jax import Array
-
-from forgetmimic_jax.ppo.loss import Batch, Prediction, ppo_loss
-from forgetmimic_jax.settings.config import Config
-from forgetmimic_jax.tracking.reward import Reward
-
-
-def plain_reward(config: Config, reward: Reward, is_target: Array, key: Array) -> Array:
-    """R [env] = R_track + R_reg."""
-    return reward.tracking + reward.regularisation
-
-
-def plain_observation(observation: Array, is_target: Array) -> Array:
-    """The actor's observation [env, features] as it is."""
-    return observation
+from forgetmimic_jax.ppo.rule import Rule
 
 
 @dataclass(frozen=True)
@@ -56,26 +42,19 @@ FINE_TUNING = Pace({"cpu": 640, "paper": 1000}, {"cpu": SHORT}, {"cpu": 0.5})
 
 
 @dataclass(frozen=True)
-class Method:
-    """A training rule as its differences from PPO; without any, PPO fine-tuning of the base on all clips.
+class Method(Rule):
+    """An unlearning method: its rule, and what its runs start from. Without any difference, fine-tuning on all clips.
 
     Args:
-        reward: (config, the step's parts [env], is_target bool[env], random key) → training reward [env], per second.
-        observation: (actor observation [env, features], is_target bool[env]) → what the actor sees in training.
-        loss: (config, batch, what the networks say now, iteration i32[]) → the loss [] to minimise and its parts.
+        reward, observation, loss, simulate: see `Rule`.
         clips: which clips episodes start from, unless the user says otherwise (`sampling.clips`).
         start: from the base with uniform sampling and no wrench; a fresh policy that the base teaches, the same way; or
             a fresh policy with the base's own settings.
-        simulate: whether steps are simulated, or reference states with reset noise stand for them.
         result: what evaluation.json calls the policy.
         pace: how long it trains and with which PPO settings.
     """
 
-    reward: Callable[[Config, Reward, Array, Array], Array] = plain_reward
-    observation: Callable[[Array, Array], Array] = plain_observation
-    loss: Callable[[Config, Batch, Prediction, Array], tuple[Array, dict[str, Array]]] = ppo_loss
     clips: Literal["all", "kept"] = "all"
     start: Literal["base", "taught", "fresh"] = "base"
-    simulate: bool = True
     result: Literal["unlearned", "retrained", "fine_tuned"] = "unlearned"
     pace: Pace = FINE_TUNING

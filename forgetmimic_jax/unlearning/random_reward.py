@@ -11,9 +11,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from forgetmimic_jax.ppo.rule import plain_reward
 from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking.reward import Reward, total_tracking_weight
-from forgetmimic_jax.unlearning.method import Method, plain_reward
+from forgetmimic_jax.unlearning.method import Method
 
 
 def random_on_targets(config: Config, reward: Reward, is_target: Array, key: Array) -> Array:

@@ -15,9 +15,10 @@ import jax.numpy as jnp
 from jax import Array
 
 from forgetmimic_jax.ppo.loss import Batch, Prediction, mean, ppo_loss
+from forgetmimic_jax.ppo.rule import plain_reward
 from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking.reward import Reward
-from forgetmimic_jax.unlearning.method import Method, plain_reward
+from forgetmimic_jax.unlearning.method import Method
 
 BLOCKS = 32  # of the forgetting phase, give or take its last ones: a block is a whole number of iterations
 FORGETTING, DISTANCE = 0.8, 0.1

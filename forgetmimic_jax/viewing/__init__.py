@@ -1,1 +1,4 @@
-"""Seeing policies: the same episode side by side, drawn offscreen for videos and live for a web page."""
+"""Films, stills and the live page in a browser.
+
+The figures of an evaluation are in `evaluation`.
+"""

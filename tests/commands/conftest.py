@@ -18,9 +18,9 @@ def compiled_once() -> Iterator[None]:
     """Runs of the same settings share one compiled iteration; it depends on none of the settings left out here."""
     make, compiled = run.make_iteration, {}
 
-    def shared(env):
+    def shared(env, rule):
         key = dataclasses.replace(env.config, iterations=1, checkpoint_every=1, base=None, seed=0)
-        return compiled.setdefault(key, make(env))
+        return compiled.setdefault(key, make(env, rule))
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run, "make_iteration", shared)

@@ -6,7 +6,7 @@ import pytest
 from miniature import finished
 
 from forgetmimic_jax import evaluate
-from forgetmimic_jax.physics.engine import resolve_engine
+from forgetmimic_jax.physics.choose import resolve_engine
 from forgetmimic_jax.settings.options import on_engine, parse
 from forgetmimic_jax.training.checkpoint import policy_hash, read_info
 from forgetmimic_jax.training.comparison import load_comparison

@@ -17,7 +17,7 @@ from forgetmimic_jax.ppo.update import make_iteration
 from forgetmimic_jax.tracking.env import Assets, Environment, make_assets, make_environment
 from forgetmimic_jax.tracking.observation import actor_size
 from forgetmimic_jax.tracking.setup import Setup
-from forgetmimic_jax.unlearning.registry import unlearning_config
+from forgetmimic_jax.unlearning.registry import method_of, unlearning_config
 
 ENVS, STEPS, CONTROL_STEP = 8, 2, 0.02
 DISCOUNT, GAE_LAMBDA, PENALTY = 0.9, 0.7, 16.0
@@ -29,7 +29,7 @@ SWAY, TURN = 0, 1  # the clip to keep and the clip to forget
 
 def collected(env: Environment, assets: Assets, state: TrainState) -> dict[str, jax.Array]:
     """The arrays [time, env, ...] of a rollout by name."""
-    _, transition, outcome = collect(env, assets, state)
+    _, transition, outcome = collect(env, assets, state, method_of(env.config))
     return {**vars(transition), **vars(outcome)}
 
 
@@ -63,7 +63,7 @@ class Run:
     def __post_init__(self):
         self._begin = jax.jit(lambda assets: init_state(self.env, assets, jax.random.PRNGKey(0)))
         self._collect = jax.jit(lambda assets, state: collected(self.env, assets, state))
-        self._iterate = make_iteration(self.env)
+        self._iterate = make_iteration(self.env, method_of(self.env.config))
 
     def begin(self, assets: Assets | None = None) -> TrainState:
         return self._begin(assets or self.assets)

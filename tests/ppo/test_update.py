@@ -14,13 +14,14 @@ from forgetmimic_jax.policy.normalizer import Normalizer
 from forgetmimic_jax.policy.policy import init_policy
 from forgetmimic_jax.ppo.collect import collect
 from forgetmimic_jax.ppo.log import rollout_metrics
+from forgetmimic_jax.ppo.rule import Rule
 from forgetmimic_jax.ppo.state import TrainState, init_state, make_optimizer
 from forgetmimic_jax.ppo.transition import Outcome, Transition
 from forgetmimic_jax.ppo.update import improve, learn_normalizers, learn_sampler, make_batch, make_iteration
 from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking.env import Assets, Environment, make_assets
 from forgetmimic_jax.tracking.setup import Setup
-from forgetmimic_jax.unlearning.registry import unlearning_config
+from forgetmimic_jax.unlearning.registry import method_of, unlearning_config
 
 ENVS, STEPS, CONTROL_STEP = 8, 4, 0.02
 PHASE = 571  # the clip's phase in the critic's observation
@@ -66,8 +67,8 @@ def run(robot, library, tiny_config) -> Run:
         env=env,
         assets=assets,
         start=lambda: begin(assets, jax.random.PRNGKey(0)),
-        iterate=make_iteration(env),
-        collect=jax.jit(lambda assets, state: collect(env, assets, state)),
+        iterate=make_iteration(env, method_of(config)),
+        collect=jax.jit(lambda assets, state: collect(env, assets, state, method_of(env.config))),
     )
 
 
@@ -84,6 +85,12 @@ def transition(rollout) -> Transition:
 @pytest.fixture(scope="module")
 def outcome(rollout) -> Outcome:
     return rollout[1]
+
+
+def collected(env: Environment, assets: Assets, state: TrainState) -> tuple[Transition, Outcome]:
+    """A rollout by the method that the environment's config names."""
+    rule = method_of(env.config)
+    return jax.device_get(jax.jit(lambda assets, state: collect(env, assets, state, rule))(assets, state)[1:])
 
 
 def finite(tree) -> bool:
@@ -155,7 +162,9 @@ def test_branches_set_out_from_their_leaders_state_and_part(run):
     ppo = dataclasses.replace(run.env.config.ppo, branches=4)
     env = dataclasses.replace(run.env, config=dataclasses.replace(run.env.config, ppo=ppo))
     state = run.start()
-    seen = jax.jit(lambda assets, state: collect(env, assets, state))(run.assets, state)[1].critic_observation
+    seen = jax.jit(lambda assets, state: collect(env, assets, state, method_of(env.config)))(run.assets, state)[
+        1
+    ].critic_observation
     alone = run.collect(run.assets, run.start())[1].critic_observation
     np.testing.assert_allclose(seen[0], np.asarray(alone[0])[[0, 0, 0, 0, 4, 4, 4, 4]], atol=1e-5)
     assert len(np.unique(seen[1], axis=0)) == ENVS
@@ -214,7 +223,7 @@ class Problem:
 
         def function(state, transition, value, advantage, value_target):
             batch = make_batch(config, self.assets, transition, value, advantage, value_target)
-            state, metrics = improve(config, state, batch)
+            state, metrics = improve(config, state, batch, Rule())
             return learn_normalizers(state, transition), metrics
 
         return jax.jit(function)(self.state, self.transition, self.value, self.advantage, self.value_target)
@@ -382,7 +391,9 @@ def with_method(run: Run, name: str) -> Environment:
 
 def test_what_a_method_shows_the_actor_is_what_it_acts_on(run, transition):
     env = with_method(run, "poisoning")
-    found = jax.device_get(jax.jit(lambda assets, state: collect(env, assets, state))(run.assets, run.start())[1])
+    found = jax.device_get(
+        jax.jit(lambda assets, state: collect(env, assets, state, method_of(env.config)))(run.assets, run.start())[1]
+    )
     first, on_target = slice(0, 1), transition.clip[0] == 1
     true, shown = transition.actor_observation[first], found.actor_observation[first]
     np.testing.assert_array_equal(shown[:, ~on_target], true[:, ~on_target])
@@ -396,8 +407,7 @@ def test_a_random_reward_is_drawn_apart_from_the_actions(run):
     """Both are monotone in the random bits they are made of, so the same bits would show as the same order."""
     env = with_method(run, "random_reward")
     assets = dataclasses.replace(run.assets, is_target=jnp.ones_like(run.assets.is_target))
-    collected = jax.jit(lambda assets, state: collect(env, assets, state))(assets, run.start())
-    found, outcome = jax.device_get(collected[1:])
+    found, outcome = collected(env, assets, run.start())
     noise = (found.action - found.mean).reshape(len(outcome.reward), -1)[:, :ENVS]
     assert all(np.ptp(rewards) > 0 for rewards in outcome.reward)
     assert not any((rewards.argsort() == of.argsort()).all() for rewards, of in zip(outcome.reward, noise, strict=True))
@@ -409,7 +419,7 @@ def test_an_iteration_without_a_simulator_moves_no_robot_and_only_the_actor_lear
     state = run.start()
     assets = dataclasses.replace(run.assets, base=jax.tree.map(jnp.copy, state.policy))
     before = jax.device_get(state)
-    after, metrics = jax.device_get(make_iteration(env)(assets, state))
+    after, metrics = jax.device_get(make_iteration(env, method_of(env.config))(assets, state))
     for one, two in zip(jax.tree.leaves(before.env), jax.tree.leaves(after.env), strict=True):
         np.testing.assert_array_equal(one, two)
     np.testing.assert_array_equal(before.failure_level, after.failure_level)
@@ -437,7 +447,7 @@ def test_the_base_is_compared_where_the_method_asks_for_it(run):
     env = dataclasses.replace(env, config=config)
     # with no target step, a policy that still is the base has nothing to change
     kept_only = dataclasses.replace(assets, is_target=jnp.zeros_like(assets.is_target))
-    _, metrics = jax.device_get(make_iteration(env)(kept_only, state))
+    _, metrics = jax.device_get(make_iteration(env, method_of(env.config))(kept_only, state))
     assert float(metrics["policy_loss"]) == pytest.approx(0.0, abs=1e-5)
     assert float(metrics["value_loss"]) == pytest.approx(0.0, abs=1e-5)
     assert float(metrics["gradient_norm"]) == pytest.approx(0.0, abs=1e-4)

@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from forgetmimic_jax.ppo.threshold import threshold_metrics
 from forgetmimic_jax.settings.config import Config, UnlearnConfig
 from forgetmimic_jax.tracking.reward import Reward
 from forgetmimic_jax.unlearning.arft import METHOD
-from forgetmimic_jax.unlearning.threshold import threshold_metrics
 
 
 def forgetting(penalty: float, method: str = "arft") -> Config:

@@ -1,0 +1,30 @@
+"""Which engine a config means, and how it is made."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import jax
+
+from forgetmimic_jax.physics.engine import Engine
+from forgetmimic_jax.robot.model import Robot
+from forgetmimic_jax.settings.config import PhysicsConfig
+
+
+def resolve_engine(name: Literal["auto", "native", "mjx", "mjx-warp"]) -> str:
+    """`auto` becomes native on a CPU and mjx on a GPU or TPU."""
+    if name != "auto":
+        return name
+    return "native" if jax.default_backend() == "cpu" else "mjx"
+
+
+def make_engine(robot: Robot, config: PhysicsConfig, num_envs: int) -> Engine:
+    """The engine that `config.engine` names, for a batch of `num_envs` robots."""
+    name = resolve_engine(config.engine)
+    if name == "native":
+        from forgetmimic_jax.physics.native import NativeEngine
+
+        return NativeEngine(robot, config.substeps, num_envs)
+    from forgetmimic_jax.physics.mjx import MjxEngine
+
+    return MjxEngine(robot, config.substeps, implementation="warp" if name == "mjx-warp" else "jax")
