@@ -56,7 +56,7 @@ def main(options: Options) -> None:
     from forgetmimic_jax.basics.console import closing, command_line
     from forgetmimic_jax.basics.files import read_rows, write_atomically
     from forgetmimic_jax.evaluation import plots, tables
-    from forgetmimic_jax.evaluation.verdict import RULES, judge
+    from forgetmimic_jax.evaluation.verdict import NO_CONTROL, NO_RELEARNING, RULES, judge
     from forgetmimic_jax.training import checkpoint
     from forgetmimic_jax.training.folder import check_writable
 
@@ -69,14 +69,14 @@ def main(options: Options) -> None:
     check_writable(output.parent)
     info = checkpoint.read_info(path)
     base = _base(options, document, info)
-    control = None if options.control is None else _control(options.control, document)
-    relearning = None if options.relearning is None else _relearning(options.relearning, document)
+    control = NO_CONTROL if options.control is None else _control(options.control, document)
+    relearning = NO_RELEARNING if options.relearning is None else _relearning(options.relearning, document)
     verdict = judge(document["policies"], control=control, relearning=relearning)
     rows = [row for row in read_rows(options.run / "metrics.jsonl") if "target/lambda_crit" in row]
     films, films_missing = _films(options, document, info, base)
 
     facts = {
-        "verdict": {"word": verdict.word, "reasons": list(verdict.reasons), "rules": RULES},
+        "verdict": {"phrase": verdict.phrase, "reasons": list(verdict.reasons), "rules": RULES},
         "asked": _asked(document),
         "done": _done(document, info, base, rows),
         "cards": _cards(document, rows),
@@ -112,7 +112,7 @@ def main(options: Options) -> None:
     write_atomically(as_json, (json.dumps(facts | {"evaluation": document}, indent=2) + "\n").encode())
     write_atomically(output, page.encode())
     console = Console()
-    console.print(f"{verdict.word}: {' '.join(verdict.reasons)}", highlight=False, soft_wrap=True)
+    console.print(f"{verdict.phrase}: {' '.join(verdict.reasons)}", highlight=False, soft_wrap=True)
     if films_missing:
         console.print(films_missing, highlight=False, soft_wrap=True)
     closing({"report": output, "facts": as_json}, command_line("export", robot=document["robot"], checkpoint=path))

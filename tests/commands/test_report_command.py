@@ -108,7 +108,7 @@ def test_the_tables_are_those_of_the_evaluation(page, run):
 
 
 def test_the_facts_lie_beside_it(facts, run):
-    assert facts["verdict"]["word"] in RULES
+    assert facts["verdict"]["phrase"] in RULES
     assert facts["verdict"]["rules"] == RULES
     assert facts["evaluation"] == json.loads((run / "evaluation.json").read_text())
     assert facts["done"]["Penalty λ"] == "16"
@@ -142,7 +142,9 @@ def test_comparisons_enter_the_verdict(run, tmp_path):
     document = json.loads((copy / "evaluation.json").read_text())
     for group, mean in (("target", 0.0), ("kept", 1.0)):
         skill = {"mean": mean, "low": mean - 0.1, "high": mean + 0.1, "std": 0.1, "n": 3}
-        document["policies"]["unlearned"][group]["skill"] = skill
+        for clip in document["policies"]["unlearned"]["clips"].values():
+            if clip["target"] == (group == "target"):
+                clip["skill"] = skill
     tracking = {"mean": 0.15, "low": 0.12, "high": 0.18, "std": 0.1, "n": 3}
     document["policies"]["unlearned"]["target"]["survival_weighted_tracking"] = tracking
     (copy / "evaluation.json").write_text(json.dumps(document))
@@ -165,11 +167,11 @@ def test_comparisons_enter_the_verdict(run, tmp_path):
         options = report.Options(run=copy, control=control, relearning=counts, films=0, output=tmp_path / "r.html")
         printed = finished(report.main, options).printed
         facts = json.loads((tmp_path / "r.json").read_text())
-        assert printed.startswith(f"{facts['verdict']['word']}: ")
+        assert printed.startswith(f"{facts['verdict']['phrase']}: ")
         assert not any("never lived" in limit or "bring the" in limit for limit in facts["limits"])
         assert "Relearning was measured on the study's own unlearned policies, not on this one." in facts["limits"]
         assert facts["commands"][1].endswith(f"--control {control} --relearning {counts}")
-        return facts["verdict"]["word"]
+        return facts["verdict"]["phrase"]
 
     assert word(900) == "consistent with retraining"
     assert word(100) == "suppressed but recoverable"
