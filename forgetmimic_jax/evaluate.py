@@ -37,7 +37,7 @@ class Options:
 def main(options: Options) -> None:
     """Evaluate, write the files and print the table."""
     from forgetmimic_jax.basics.console import closing, command_line
-    from forgetmimic_jax.evaluation.evaluate import cost, evaluate, show_and_write
+    from forgetmimic_jax.evaluation.evaluate import evaluate, show_and_write
     from forgetmimic_jax.training.comparison import load_comparison
     from forgetmimic_jax.training.folder import check_writable, folder_of
     from forgetmimic_jax.training.start import base_folder
@@ -59,11 +59,11 @@ def main(options: Options) -> None:
     document = evaluate(
         setup,
         compared.policies,
+        compared.info,
         checkpoint=str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path),
         targets=compared.targets,
         episodes=options.episodes,
         seed=options.seed,
-        budget={name: cost(info) for name, info in compared.info.items()},
     )
     base = options.checkpoint if list(compared.info) == ["base"] else None
     closing(show_and_write(output, document), command_line("unlearn", robot=options.robot, base=base))

@@ -74,7 +74,7 @@ class Options:
 def main(options: Options) -> None:
     """Unlearn, evaluate base, new policy and zero action, and print what was forgotten and what was kept."""
     from forgetmimic_jax.basics.console import closing, command_line
-    from forgetmimic_jax.evaluation.evaluate import cost, evaluate, show_and_write
+    from forgetmimic_jax.evaluation.evaluate import evaluate, show_and_write
     from forgetmimic_jax.tracking.setup import make_setup
     from forgetmimic_jax.training import checkpoint
     from forgetmimic_jax.training.folder import default_folder, prepare_folder
@@ -104,11 +104,11 @@ def main(options: Options) -> None:
         document = evaluate(
             setup,
             {"base": base, method.result: state.policy},
+            {"base": info, method.result: checkpoint.read_info(path)},
             checkpoint=str(path),
             targets=config.unlearn.targets,
             episodes=options.episodes,
             seed=config.seed,
-            budget={"base": cost(info), method.result: cost(checkpoint.read_info(path))},
         )
     except KeyboardInterrupt:
         raise interrupted(config, output) from None

@@ -11,11 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from math import inf
+from typing import NamedTuple
 
+from forgetmimic_jax.evaluation.document import Estimate, PolicyResult
 from forgetmimic_jax.evaluation.metrics import UNLEARNED
 from forgetmimic_jax.evaluation.relearning import Lasted
-from forgetmimic_jax.evaluation.statistics import Estimate
 from forgetmimic_jax.evaluation.tables import FORGOTTEN, KEPT, percent
 
 CONSISTENT, RECOVERABLE = "consistent with retraining", "suppressed but recoverable"
@@ -33,7 +34,7 @@ FASTER = 0.5  # relearning within this share of the control's target steps means
 
 
 def _bound(share: float) -> str:
-    return percent({"mean": share})
+    return percent(Estimate(mean=share))
 
 
 RULES = {
@@ -77,14 +78,30 @@ class NotMeasured:
     reason: str
 
 
+class Skill(NamedTuple):
+    """A defined skill and its interval, which is infinite where too few episodes were measured for one."""
+
+    mean: float
+    low: float
+    high: float
+
+    @property
+    def estimate(self) -> Estimate:
+        """The same, without an infinite interval."""
+        return Estimate(self.mean) if self.high == inf else Estimate(*self)
+
+    def __str__(self) -> str:
+        return percent(self.estimate)
+
+
 NO_CONTROL = NotMeasured("It was not compared with a control that never rolled out a target clip.")
 NO_RELEARNING = NotMeasured("How fast it relearns the targets was not measured.")
 
 
 def judge(
-    policies: Mapping[str, Any],
+    policies: Mapping[str, PolicyResult],
     *,
-    control: Mapping[str, Any] | NotMeasured = NO_CONTROL,
+    control: PolicyResult | NotMeasured = NO_CONTROL,
     relearning: Mapping[str, tuple[Lasted, Lasted]] | NotMeasured = NO_RELEARNING,
 ) -> Verdict:
     """The verdict on the policy `unlearned` of an evaluation.
@@ -95,108 +112,113 @@ def judge(
         relearning: by seed, how long the unlearned policy and the control took until 80 % of the base's tracking on the
             targets.
     """
-    clips = policies[UNLEARNED]["clips"]
-    target, kept = (skills(clips, target=is_target) for is_target in (True, False))
+    target, kept = (skills(policies[UNLEARNED], target=is_target) for is_target in (True, False))
     for what, skill in (("targets", target), ("kept clips", kept)):
         if not skill:
             none = f"The base itself is hardly better than the zero-action baseline on the {what}: no skill is defined."
             return Verdict(INCONCLUSIVE, (none,))
-    without = [clip for skill in (target, kept) for clip, of in skill.items() if not {"low", "high"} <= of.keys()]
+    without = [clip for clip, skill in (target | kept).items() if skill.high == inf]
     if without:
-        few = f"Too few episodes for an interval: {', '.join(without)}."
-        return Verdict(INCONCLUSIVE, (few,))
+        return Verdict(INCONCLUSIVE, (f"Too few episodes for an interval: {', '.join(without)}.",))
     failures, doubts = _forgotten_and_kept(target, kept)
     if failures or doubts:
         return Verdict(FAILED if failures else INCONCLUSIVE, tuple(failures or doubts))
 
     found = [
         f"On these episodes the targets are forgotten ({_by_clip(target)} of the base's skill retained) and the kept "
-        f"clips are kept ({percent(retained(kept))} on average)."
+        f"clips are kept ({retained(kept)} on average)."
     ]
-    undefined = [clip for clip in clips if clip not in target and clip not in kept]
+    undefined = [clip for clip in policies[UNLEARNED].clips if clip not in target | kept]
     if undefined:
         found.append(
             f"Not judged, since the base itself is hardly better than the zero-action baseline: {', '.join(undefined)}."
         )
-    below = {clip: skill for clip, skill in target.items() if skill["high"] < 0.0}
+    below = {clip: skill for clip, skill in target.items() if skill.high < 0.0}
     over = [f"It is below the zero-action baseline: over-forgotten ({_by_clip(below)} of the base's skill)."]
     found += over if below else []
 
-    sooner: list[bool | None] = []
-    if not isinstance(relearning, NotMeasured):
-        sooner = [_sooner(*pair) for pair in relearning.values()]
-        if sooner and all(sooner):
-            return Verdict(
-                RECOVERABLE, (*found, f"It relearns the targets faster than the control: {_steps(relearning)}.")
-            )
-    missing = []
-    if isinstance(control, NotMeasured):
-        missing.append(control.reason)
-    else:
-        theirs = skills(control["clips"], target=True)
-        unlike = [clip for clip in target if clip not in theirs or _furthest(target[clip], theirs[clip]) > ALIKE]
-        if unlike:
-            pairs = "; ".join(f"{clip}: {percent(target[clip])} against {percent(theirs.get(clip))}" for clip in unlike)
-            missing.append(f"Its skill may differ by more than {_bound(ALIKE)} from the control's: {pairs}.")
-    if isinstance(relearning, NotMeasured):
-        missing.append(relearning.reason)
-    elif any(sooner):
-        missing.append(f"With some seeds it relearns the targets faster than the control: {_steps(relearning)}.")
-    elif None in sooner or not sooner:
-        missing.append(f"Relearning was stopped too early to compare: {_steps(relearning)}.")
-    if missing or below:
-        return Verdict(INCONCLUSIVE, (*found, *missing))
-    assert not isinstance(relearning, NotMeasured)
-    found.append(f"On every target its skill is within {_bound(ALIKE)} of the control's.")
-    return Verdict(
-        CONSISTENT, (*found, f"It does not relearn the targets faster than the control: {_steps(relearning)}.")
-    )
+    faster, pace = _relearning_pace(relearning)
+    if faster:
+        return Verdict(RECOVERABLE, (*found, pace))
+    doubts = _unlike(target, control) + ([pace] if faster is None else [])
+    if doubts or below:
+        return Verdict(INCONCLUSIVE, (*found, *doubts))
+    alike = f"On every target its skill is within {_bound(ALIKE)} of the control's."
+    return Verdict(CONSISTENT, (*found, alike, pace))
 
 
-def skills(clips: Mapping[str, Any], *, target: bool) -> dict[str, Estimate]:
+def skills(policy: PolicyResult, *, target: bool) -> dict[str, Skill]:
     """The defined skills, signed, of a policy's targets or of its kept clips."""
-    return {clip: of["skill"] for clip, of in clips.items() if of["target"] == target and "mean" in of.get("skill", {})}
+    found = {name: clip.skill for name, clip in policy.clips.items() if clip.target == target}
+    return {
+        name: Skill(skill.mean, -inf if skill.low is None else skill.low, inf if skill.high is None else skill.high)
+        for name, skill in found.items()
+        if skill is not None and skill.mean is not None
+    }
 
 
-def retained(skill: Mapping[str, Estimate]) -> Estimate:
+def retained(skill: Mapping[str, Skill]) -> Skill:
     """Skill that a group of clips retains: the mean over its clips, where a negative skill counts as 0.
 
     So a clip that was sabotaged never pays for one that is still known. The interval takes the low ends of all clips
     together, then the high ends: it is wider than a 95 % interval of the mean, so in doubt the verdict is inconclusive.
     """
-    count = len(skill)
-    mean, low, high = (
-        sum(max(0.0, of[end]) for of in skill.values()) / count  # type: ignore[literal-required]
-        for end in ("mean", "low", "high")
-    )
-    return Estimate(mean=mean, low=low, high=high, n=count)
+    mean, low, high = (sum(max(0.0, end) for end in ends) / len(skill) for ends in zip(*skill.values(), strict=True))
+    return Skill(mean, low, high)
 
 
-def _forgotten_and_kept(target: Mapping[str, Estimate], kept: Mapping[str, Estimate]) -> tuple[list[str], list[str]]:
+def _forgotten_and_kept(target: Mapping[str, Skill], kept: Mapping[str, Skill]) -> tuple[list[str], list[str]]:
     """What failed, and what an interval leaves in doubt."""
     failures, doubts = [], []
     for clip, skill in target.items():
-        if skill["low"] > FORGOTTEN:
-            failures.append(f"The target {clip} is still known: {percent(skill)} of the base's skill retained.")
-        elif skill["high"] > FORGOTTEN:
-            doubts.append(f"Whether the target {clip} is forgotten is not sure: {percent(skill)} of the base's skill.")
+        if skill.low > FORGOTTEN:
+            failures.append(f"The target {clip} is still known: {skill} of the base's skill retained.")
+        elif skill.high > FORGOTTEN:
+            doubts.append(f"Whether the target {clip} is forgotten is not sure: {skill} of the base's skill.")
     for clip, skill in kept.items():
-        if skill["high"] < KEPT_CLIP:
-            failures.append(f"The kept clip {clip} was lost: {percent(skill)} of the base's skill retained.")
-        elif skill["low"] < KEPT_CLIP:
-            doubts.append(f"Whether the kept clip {clip} was lost is not sure: {percent(skill)} of the base's skill.")
+        if skill.high < KEPT_CLIP:
+            failures.append(f"The kept clip {clip} was lost: {skill} of the base's skill retained.")
+        elif skill.low < KEPT_CLIP:
+            doubts.append(f"Whether the kept clip {clip} was lost is not sure: {skill} of the base's skill.")
     together = retained(kept)
-    if together["high"] < KEPT:
-        failures.append(f"The kept clips were not kept: {percent(together)} of the base's skill on average.")
-    elif together["low"] < KEPT:
-        doubts.append(
-            f"Whether the kept clips are kept is not sure: {percent(together)} of the base's skill on average."
-        )
+    if together.high < KEPT:
+        failures.append(f"The kept clips were not kept: {together} of the base's skill on average.")
+    elif together.low < KEPT:
+        doubts.append(f"Whether the kept clips are kept is not sure: {together} of the base's skill on average.")
     return failures, doubts
 
 
-def _by_clip(skill: Mapping[str, Estimate]) -> str:
-    return ", ".join(f"{clip} {percent(of)}" for clip, of in skill.items())
+def _by_clip(skill: Mapping[str, Skill]) -> str:
+    return ", ".join(f"{clip} {of}" for clip, of in skill.items())
+
+
+def _unlike(target: Mapping[str, Skill], control: PolicyResult | NotMeasured) -> list[str]:
+    """Why it is not sure that the policy does on the targets what the control does."""
+    if isinstance(control, NotMeasured):
+        return [control.reason]
+    theirs = skills(control, target=True)
+    unlike = [clip for clip in target if clip not in theirs or _furthest(target[clip], theirs[clip]) > ALIKE]
+    pairs = "; ".join(f"{clip}: {target[clip]} against {theirs.get(clip, 'none')}" for clip in unlike)
+    return [f"Its skill may differ by more than {_bound(ALIKE)} from the control's: {pairs}."] if unlike else []
+
+
+def _furthest(one: Skill, other: Skill) -> float:
+    """The largest difference that the two intervals allow."""
+    return max(one.high - other.low, other.high - one.low)
+
+
+def _relearning_pace(relearning: Mapping[str, tuple[Lasted, Lasted]] | NotMeasured) -> tuple[bool | None, str]:
+    """Whether the policy relearns the targets faster than the control, None where that is not sure; in words."""
+    if isinstance(relearning, NotMeasured):
+        return None, relearning.reason
+    sooner = [_sooner(*pair) for pair in relearning.values()]
+    if sooner and all(sooner):
+        return True, f"It relearns the targets faster than the control: {_steps(relearning)}."
+    if any(sooner):
+        return None, f"With some seeds it relearns the targets faster than the control: {_steps(relearning)}."
+    if None in sooner or not sooner:
+        return None, f"Relearning was stopped too early to compare: {_steps(relearning)}."
+    return False, f"It does not relearn the targets faster than the control: {_steps(relearning)}."
 
 
 def _sooner(unlearned: Lasted, control: Lasted) -> bool | None:
@@ -204,13 +226,6 @@ def _sooner(unlearned: Lasted, control: Lasted) -> bool | None:
     if unlearned.target_steps < FASTER * control.target_steps:
         return True if unlearned.there else None
     return False if control.there else None
-
-
-def _furthest(one: Estimate, other: Estimate) -> float:
-    """The largest difference that the two intervals allow; infinite without an interval."""
-    if not {"low", "high"} <= other.keys():
-        return float("inf")
-    return max(one["high"] - other["low"], other["high"] - one["low"])
 
 
 def _steps(relearning: Mapping[str, tuple[Lasted, Lasted]]) -> str:

@@ -274,6 +274,19 @@ def to_dict(config: Config) -> dict[str, Any]:
     return json.loads(json.dumps(dataclasses.asdict(config)))
 
 
+def by_name(config: Config) -> dict[str, Any]:
+    """Every setting by its dotted name, such as `ppo.learning_rate`; tuples as lists."""
+
+    def settings(content: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+        for name, value in content.items():
+            if isinstance(value, dict):
+                yield from settings(value, f"{prefix}{name}.")
+            else:
+                yield f"{prefix}{name}", value
+
+    return dict(settings(to_dict(config), ""))
+
+
 def config_hash(config: Config) -> str:
     """Content hash (16 hex digits) of every setting that changes a result."""
     content = to_dict(config)

@@ -5,8 +5,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from forgetmimic_jax.evaluation.document import ClipResult, Estimate, PolicyResult
 from forgetmimic_jax.evaluation.relearning import Lasted
-from forgetmimic_jax.evaluation.report import evaluate_policies
+from forgetmimic_jax.evaluation.summary import evaluate_policies
 from forgetmimic_jax.evaluation.verdict import (
     CONSISTENT,
     FAILED,
@@ -14,6 +15,7 @@ from forgetmimic_jax.evaluation.verdict import (
     RECOVERABLE,
     RULES,
     NotMeasured,
+    Skill,
     judge,
     retained,
 )
@@ -72,7 +74,7 @@ def test_one_of_ten_kept_clips_that_is_lost_is_a_failure(evaluated):
     base, zero = {"punch": 0.8, **KEPT}, {"punch": 0.05, **FELL}
     lost = {"punch": 0.06, **KEPT, "kept3": 0.05}
     policies = evaluated(["punch"], base=base, zero_action=zero, unlearned=lost, control={"punch": 0.06, **KEPT})
-    assert policies["unlearned"]["kept"]["skill"]["mean"] == pytest.approx(0.9, abs=1e-3)
+    assert policies["unlearned"].kept.skill.mean == pytest.approx(0.9, abs=1e-3)
     verdict = judge(policies, control=policies["control"], relearning=SLOW)
     assert verdict.phrase == FAILED
     (reason,) = verdict.reasons
@@ -85,7 +87,7 @@ def test_a_sabotaged_target_does_not_pay_for_one_that_is_still_known(evaluated):
     policies = evaluated(
         ["punch", "kick"], base=base, zero_action=zero, unlearned=mixed, control={"punch": 0.25, "kick": 0.25, **KEPT}
     )
-    assert policies["unlearned"]["target"]["skill"]["mean"] == pytest.approx(0.1, abs=1e-3)
+    assert policies["unlearned"].target.skill.mean == pytest.approx(0.1, abs=1e-3)
     verdict = judge(policies, control=policies["control"], relearning=SLOW)
     assert verdict.phrase == FAILED
     (reason,) = verdict.reasons
@@ -96,7 +98,7 @@ def test_a_policy_that_falls_at_once_is_over_forgotten_however_near_the_control_
     base, zero = {"dance": 0.8, **KEPT}, {"dance": 0.03, **FELL}
     at_once = {"dance": 0.003, **KEPT}
     policies = evaluated(["dance"], base=base, zero_action=zero, unlearned=at_once, control={"dance": 0.092, **KEPT})
-    tracking = [policies[name]["target"]["survival_weighted_tracking"]["mean"] for name in ("unlearned", "control")]
+    tracking = [policies[name].target.survival_weighted_tracking.mean for name in ("unlearned", "control")]
     assert tracking == pytest.approx([0.003, 0.092], abs=1e-3)
     verdict = judge(policies, control=policies["control"], relearning=SLOW)
     assert verdict.phrase == INCONCLUSIVE
@@ -137,24 +139,31 @@ def test_a_clip_that_the_base_cannot_do_is_left_out_and_named(evaluated):
 # From here on the skills are given.
 
 
-def interval(low: float, high: float) -> dict:
-    return {"mean": (low + high) / 2, "low": low, "high": high, "std": 0.1, "n": 20}
+def interval(low: float, high: float) -> Estimate:
+    return Estimate(mean=(low + high) / 2, low=low, high=high, std=0.1, n=20)
 
 
-FORGOTTEN, WHOLE = interval(-0.1, 0.1), interval(0.9, 1.1)
+FORGOTTEN, WHOLE, ONE_EPISODE = interval(-0.1, 0.1), interval(0.9, 1.1), Estimate(mean=0.0, n=1)
+ANY = Estimate()
+METRICS = ("tracking_reward", "survival_weighted_tracking", "success_rate", "episode_length")
 
 
-def result(targets: list[dict], kept: list[dict]) -> dict:
-    """A policy whose clips have these skills."""
-    clips = {f"t{number}": {"target": True, "skill": skill} for number, skill in enumerate(targets)}
-    return {"clips": clips | {f"k{number}": {"target": False, "skill": skill} for number, skill in enumerate(kept)}}
+def result(targets: list[Estimate | None], kept: list[Estimate | None]) -> PolicyResult:
+    """A policy whose clips have these skills; None is a skill that is not defined."""
+    skills = {f"t{number}": skill for number, skill in enumerate(targets)}
+    skills |= {f"k{number}": skill for number, skill in enumerate(kept)}
+    clips = {
+        name: ClipResult(target=name.startswith("t"), skill=skill, **dict.fromkeys(METRICS, ANY))
+        for name, skill in skills.items()
+    }
+    return PolicyResult(clips=clips, nan_resets=0)
 
 
-def policies(*targets: dict, kept: tuple[dict, ...] = (WHOLE,)) -> dict:
-    return {"base": {}, "unlearned": result(list(targets or (FORGOTTEN,)), list(kept)), "zero_action": {}}
+def policies(*targets: Estimate | None, kept: tuple[Estimate | None, ...] = (WHOLE,)) -> dict[str, PolicyResult]:
+    return {"unlearned": result(list(targets or (FORGOTTEN,)), list(kept))}
 
 
-def control(low: float, high: float) -> dict:
+def control(low: float, high: float) -> PolicyResult:
     return result([interval(low, high)], [WHOLE])
 
 
@@ -178,10 +187,18 @@ def control(low: float, high: float) -> dict:
         (policies(kept=(interval(0.6, 0.8),)), INCONCLUSIVE, "Whether the kept clips are kept is not sure: 70 % [60,"),
         (policies(kept=(interval(0.79, 1.1),)), INCONCLUSIVE, "Whether the kept clips are kept is not sure: "),
         (policies(kept=(interval(0.8, 1.1),)), INCONCLUSIVE, "On these episodes the targets are"),
-        (policies({"mean": 0.0, "n": 1}), INCONCLUSIVE, "Too few episodes for an interval: t0."),
-        (policies(kept=({"mean": 1.0, "n": 1},)), INCONCLUSIVE, "Too few episodes for an interval: k0."),
-        (policies({}), INCONCLUSIVE, "The base itself is hardly better than the zero-action baseline on the targets: "),
-        (policies(kept=({},)), INCONCLUSIVE, "The base itself is hardly better than the zero-action baseline on the k"),
+        (policies(ONE_EPISODE), INCONCLUSIVE, "Too few episodes for an interval: t0."),
+        (policies(kept=(ONE_EPISODE,)), INCONCLUSIVE, "Too few episodes for an interval: k0."),
+        (
+            policies(None),
+            INCONCLUSIVE,
+            "The base itself is hardly better than the zero-action baseline on the targets: ",
+        ),
+        (
+            policies(kept=(None,)),
+            INCONCLUSIVE,
+            "The base itself is hardly better than the zero-action baseline on the k",
+        ),
     ],
 )
 def test_the_evaluation_alone(given, phrase, reason):
@@ -198,8 +215,8 @@ def test_every_failure_is_given_and_doubts_beside_failures_are_not():
 
 
 def test_a_negative_skill_counts_as_none_in_a_groups_mean():
-    group = retained({"a": interval(-0.9, -0.5), "b": interval(0.9, 1.1), "c": interval(-0.1, 0.4)})
-    assert (group["low"], group["mean"], group["high"]) == pytest.approx((0.9 / 3, 1.15 / 3, 1.5 / 3))
+    group = retained({"a": Skill(-0.7, -0.9, -0.5), "b": Skill(1.0, 0.9, 1.1), "c": Skill(0.15, -0.1, 0.4)})
+    assert group == pytest.approx((1.15 / 3, 0.9 / 3, 1.5 / 3))
 
 
 def test_what_was_not_compared_is_not_consistent():
@@ -221,8 +238,8 @@ def test_what_was_not_compared_is_not_consistent():
         (control(0.0, 0.1), SLOW, CONSISTENT),  # 0.2 from -0.1 to 0.1 and no more
         (control(0.0, 0.101), SLOW, INCONCLUSIVE),
         (control(-0.101, 0.0), SLOW, INCONCLUSIVE),
-        (result([{}], [WHOLE]), SLOW, INCONCLUSIVE),
-        (result([{"mean": 0.0, "n": 1}], [WHOLE]), SLOW, INCONCLUSIVE),
+        (result([None], [WHOLE]), SLOW, INCONCLUSIVE),
+        (result([ONE_EPISODE], [WHOLE]), SLOW, INCONCLUSIVE),
         (control(-0.1, 0.1), relearned((50_000, 100_000)), CONSISTENT),  # half is not less than half
         (control(-0.1, 0.1), FAST, RECOVERABLE),
         (control(0.3, 0.4), FAST, RECOVERABLE),
