@@ -68,6 +68,7 @@ class Method:
             a fresh policy with the base's own settings.
         simulate: whether steps are simulated, or reference states with reset noise stand for them.
         result: what evaluation.json calls the policy.
+        penalised: whether the penalty λ (`unlearn.penalty`) is a setting of the method.
         pace: how long it trains and with which PPO settings.
     """
 
@@ -78,4 +79,5 @@ class Method:
     start: Literal["base", "taught", "fresh"] = "base"
     simulate: bool = True
     result: Literal["unlearned", "retrained", "fine_tuned"] = "unlearned"
+    penalised: bool = False
     pace: Pace = FINE_TUNING
