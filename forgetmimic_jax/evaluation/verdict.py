@@ -134,17 +134,16 @@ def judge(
             f"Not judged, since the base itself is hardly better than the zero-action baseline: {', '.join(undefined)}."
         )
     below = {clip: skill for clip, skill in target.items() if skill.high < 0.0}
-    over = [f"It is below the zero-action baseline: over-forgotten ({_by_clip(below)} of the base's skill)."]
-    found += over if below else []
+    if below:
+        found.append(f"It is below the zero-action baseline: over-forgotten ({_by_clip(below)} of the base's skill).")
 
     faster, pace = _relearning_pace(relearning)
     if faster:
         return Verdict(RECOVERABLE, (*found, pace))
-    doubts = _unlike(target, control) + ([pace] if faster is None else [])
-    if doubts or below:
-        return Verdict(INCONCLUSIVE, (*found, *doubts))
+    unlike = _unlike(target, control)
     alike = f"On every target its skill is within {_bound(ALIKE)} of the control's."
-    return Verdict(CONSISTENT, (*found, alike, pace))
+    phrase = INCONCLUSIVE if unlike or below or faster is None else CONSISTENT
+    return Verdict(phrase, (*found, unlike or alike, pace))
 
 
 def skills(policy: PolicyResult, *, target: bool) -> dict[str, Skill]:
@@ -192,14 +191,14 @@ def _by_clip(skill: Mapping[str, Skill]) -> str:
     return ", ".join(f"{clip} {of}" for clip, of in skill.items())
 
 
-def _unlike(target: Mapping[str, Skill], control: PolicyResult | NotMeasured) -> list[str]:
-    """Why it is not sure that the policy does on the targets what the control does."""
+def _unlike(target: Mapping[str, Skill], control: PolicyResult | NotMeasured) -> str:
+    """Why it is not sure that the policy does on the targets what the control does; empty if it is."""
     if isinstance(control, NotMeasured):
-        return [control.reason]
+        return control.reason
     theirs = skills(control, target=True)
     unlike = [clip for clip in target if clip not in theirs or _furthest(target[clip], theirs[clip]) > ALIKE]
     pairs = "; ".join(f"{clip}: {target[clip]} against {theirs.get(clip, 'none')}" for clip in unlike)
-    return [f"Its skill may differ by more than {_bound(ALIKE)} from the control's: {pairs}."] if unlike else []
+    return f"Its skill may differ by more than {_bound(ALIKE)} from the control's: {pairs}." if unlike else ""
 
 
 def _furthest(one: Skill, other: Skill) -> float:
