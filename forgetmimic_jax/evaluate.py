@@ -12,7 +12,7 @@ from forgetmimic_jax.settings.options import at_least, comma_separated, parse
 
 @dataclass
 class Options:
-    """Roll a policy out on every clip, deterministic and unassisted, beside the zero-action floor."""
+    """Roll a policy out on every clip, deterministic and unassisted, beside the zero-action baseline."""
 
     robot: str = "g1"
     """Robot under robots/."""
@@ -21,7 +21,7 @@ class Options:
     base: Path | None = None
     """For an unlearned checkpoint, the base to compare with; the one it started from by default."""
     targets: str | None = None
-    """Clips that count as forgotten, comma-separated; by default those the checkpoint was told to forget."""
+    """Clips that count as forgotten, comma-separated; by default those that the checkpoint unlearned."""
     episodes: int = 20
     """Episodes a clip: half from frame 0, half spread over the clip."""
     seed: int = 0

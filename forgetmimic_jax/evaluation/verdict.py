@@ -22,13 +22,13 @@ from forgetmimic_jax.evaluation.tables import FORGOTTEN, KEPT, percent
 CONSISTENT, RECOVERABLE = "consistent with retraining", "suppressed but recoverable"
 INCONCLUSIVE, FAILED = "inconclusive", "failed"
 
-# One clip varies more from training to training than the mean of all: on the G1 three distilled policies retain 90 % of
-# the kept clips' skill on average, and 68 to 83 % of their weakest clip's. Below a half a clip counts as lost.
+# One clip varies more from training to training than the mean of all: on the G1 three distilled policies retain 93 % of
+# the kept clips' skill on average, and 68, 77 and 81 % on their weakest clip. Below a half a clip counts as lost.
 KEPT_CLIP = 0.5
 # Closer than this share of (base − zero action) on a target, two policies do the same there: as for `FORGOTTEN`, so
-# little skill counts as none. Distilled policies of three seeds differ by up to 0.09 from each other, and the intervals
-# of 20 episodes add some 0.1, so a smaller share would tell retrained policies apart from each other. A share, since
-# an absolute difference of tracking means little on an easy clip and all of the skill on a hard one.
+# little skill counts as none. On the G1 distilled policies of three seeds differ by up to 0.09 on a target, and their
+# intervals come on top, so that a smaller share would separate retrained policies from each other. It is a share, since
+# a difference in tracking that is little on an easy clip is all of the skill on a hard one.
 ALIKE = 0.2
 FASTER = 0.5  # relearning within this share of the control's target steps means that some skill was only hidden
 

@@ -43,7 +43,7 @@ def settings_changed(config: Config, plain: Config) -> list[str]:
 
 
 def words(flags: Mapping[str, Any], settings: Sequence[str] = ()) -> str:
-    """Flags as they are typed; those of None are left out."""
+    """Flags as they are typed; those of None are omitted."""
     typed = [
         f"--{flag} {value:g}" if isinstance(value, float) else f"--{flag} {value}"
         for flag, value in flags.items()
