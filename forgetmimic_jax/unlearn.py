@@ -74,6 +74,7 @@ class Options:
 def main(options: Options) -> None:
     """Unlearn, evaluate base, new policy and zero action, and print what was forgotten and what was kept."""
     from forgetmimic_jax.basics.console import closing, command_line
+    from forgetmimic_jax.basics.provenance import provenance
     from forgetmimic_jax.evaluation.evaluate import evaluate, show_and_write
     from forgetmimic_jax.tracking.setup import make_setup
     from forgetmimic_jax.training import checkpoint
@@ -83,6 +84,7 @@ def main(options: Options) -> None:
     from forgetmimic_jax.unlearning.registry import method_of
 
     at_least(1, "--episodes", options.episodes)
+    provenance()  # of the code that is loaded now; a checkout may change while the run trains
     output = options.output or default_folder(f"unlearn-{options.robot}", resume=options.resume)
     prepare_folder(output, resume=options.resume)
     config = _config_of_run(options, output) if options.resume else config_of_new_run(options)

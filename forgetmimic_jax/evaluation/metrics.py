@@ -88,7 +88,7 @@ def episode_metrics(rollout: Rollout, common: np.ndarray | None = None) -> dict[
 
 
 def skill(policy: np.ndarray, base: np.ndarray, zero_action: np.ndarray) -> np.ndarray:
-    """Share of the base's skill above the zero-action baseline that is retained: (SWT - SWT_0) / (SWT_b - SWT_0).
+    """Share of the base's tracking above the zero-action baseline that is retained: (SWT - SWT_0) / (SWT_b - SWT_0).
 
     1 is the base, 0 is replaying the clip through the PD loop without a policy. NaN where there is nothing to divide.
     """
