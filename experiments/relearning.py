@@ -12,16 +12,22 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import numpy as np
 
 from forgetmimic_jax.basics.files import read_rows
 from forgetmimic_jax.evaluation import paper, statistics
+from forgetmimic_jax.evaluation.document import FILE, read_evaluation
 from forgetmimic_jax.evaluation.plots import new_figure
-from forgetmimic_jax.evaluation.relearning import at_first, lasted
+from forgetmimic_jax.evaluation.relearning import Origin, Origins, at_first, comparable_settings, lasted
 from forgetmimic_jax.evaluation.tables import markdown_table, number, percent
 from forgetmimic_jax.evaluation.variants import within
+from forgetmimic_jax.evaluation.verdict import retained, skills
+from forgetmimic_jax.settings.config import load_config
 from forgetmimic_jax.studies.study import ITERATIONS, Lab, Study, main, newest_policy
+from forgetmimic_jax.training.checkpoint import policy_hash
 from forgetmimic_jax.unlearning.method import FINE_TUNING, SHORT
+from forgetmimic_jax.unlearning.registry import method_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -37,7 +43,8 @@ def measure(lab: Lab) -> dict[str, Any]:
     asked |= {("distilled", seed): {**given, "method": "distill", "seed": seed} for seed in lab.seeds}
     retrain = {"method": "retrain", "iterations": lab.control_iterations}
     asked |= {("retrained", seed): {**retrain, "seed": seed} for seed in lab.control_seeds}
-    policies = {key: newest_policy(folder) for key, folder in lab.run(asked, "policies to relearn from").items()}
+    folders = lab.run(asked, "policies to relearn from")
+    policies = {key: newest_policy(folder) for key, folder in folders.items()}
     # A start's own settings would be its training's: all of them relearn at the same fixed pace and held by nothing. On
     # a laptop the targets have as many of the starts as in unlearning: whoever wants them back would do the same.
     on_laptop = lab.options.budget == "cpu"
@@ -63,7 +70,24 @@ def measure(lab: Lab) -> dict[str, Any]:
         for (label, of), folder in relearned.items():
             if of == seed:
                 curves[label][str(seed)] = curve_of(folder, lab.targets, at_first.get(label))
-    return {"base": base, "starts": curves}
+    return {"base": base, "starts": curves, "origins": msgspec.to_builtins(origins(lab, folders))}
+
+
+def origins(lab: Lab, folders: Mapping[tuple[str, int], Path]) -> Origins:
+    """How the policies of each start were trained, so that a report can tell whether the curves belong to its run.
+
+    Args:
+        lab: of the study.
+        folders: by start and seed, the run that trained the policy.
+    """
+    starts: dict[str, Origin] = {}
+    for (label, seed), folder in folders.items():
+        config = load_config(folder / "config.yaml")
+        origin = starts.setdefault(label, Origin(comparable_settings(config), {}))
+        kept = skills(read_evaluation(folder / FILE).policies[method_of(config).result], target=False)
+        if kept:
+            origin.kept_skill[str(seed)] = retained(kept).estimate
+    return Origins(policy_hash(lab.info), starts)
 
 
 def _tracking(clips: Mapping[str, Mapping[str, float]], targets: tuple[str, ...]) -> float:

@@ -12,7 +12,7 @@ from forgetmimic_jax.settings.options import at_least, comma_separated, parse
 
 @dataclass
 class Options:
-    """Roll a policy out on every clip, deterministic and unassisted, beside the zero-action floor."""
+    """Roll a policy out on every clip, deterministic and unassisted, beside the zero-action baseline."""
 
     robot: str = "g1"
     """Robot under robots/."""
@@ -21,7 +21,7 @@ class Options:
     base: Path | None = None
     """For an unlearned checkpoint, the base to compare with; the one it started from by default."""
     targets: str | None = None
-    """Clips that count as forgotten, comma-separated; by default those the checkpoint was told to forget."""
+    """Clips that count as forgotten, comma-separated; by default those that the checkpoint unlearned."""
     episodes: int = 20
     """Episodes a clip: half from frame 0, half spread over the clip."""
     seed: int = 0
@@ -37,7 +37,7 @@ class Options:
 def main(options: Options) -> None:
     """Evaluate, write the files and print the table."""
     from forgetmimic_jax.basics.console import closing, command_line
-    from forgetmimic_jax.evaluation.evaluate import cost, evaluate, show_and_write
+    from forgetmimic_jax.evaluation.evaluate import evaluate, show_and_write
     from forgetmimic_jax.training.comparison import load_comparison
     from forgetmimic_jax.training.folder import check_writable, folder_of
     from forgetmimic_jax.training.start import base_folder
@@ -58,12 +58,11 @@ def main(options: Options) -> None:
     setup = compared.setup
     document = evaluate(
         setup,
-        compared.policies,
+        compared.subjects,
         checkpoint=str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path),
         targets=compared.targets,
         episodes=options.episodes,
         seed=options.seed,
-        budget={name: cost(info) for name, info in compared.info.items()},
     )
     base = options.checkpoint if list(compared.info) == ["base"] else None
     closing(show_and_write(output, document), command_line("unlearn", robot=options.robot, base=base))

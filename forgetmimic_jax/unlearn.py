@@ -74,15 +74,18 @@ class Options:
 def main(options: Options) -> None:
     """Unlearn, evaluate base, new policy and zero action, and print what was forgotten and what was kept."""
     from forgetmimic_jax.basics.console import closing, command_line
-    from forgetmimic_jax.evaluation.evaluate import cost, evaluate, show_and_write
+    from forgetmimic_jax.basics.provenance import provenance
+    from forgetmimic_jax.evaluation.evaluate import evaluate, show_and_write
     from forgetmimic_jax.tracking.setup import make_setup
     from forgetmimic_jax.training import checkpoint
+    from forgetmimic_jax.training.comparison import subject
     from forgetmimic_jax.training.folder import default_folder, prepare_folder
     from forgetmimic_jax.training.run import interrupted, run
     from forgetmimic_jax.training.start import base_checkpoint, base_policy
     from forgetmimic_jax.unlearning.registry import method_of
 
     at_least(1, "--episodes", options.episodes)
+    provenance()  # of the code that is loaded now; a checkout may change while the run trains
     output = options.output or default_folder(f"unlearn-{options.robot}", resume=options.resume)
     prepare_folder(output, resume=options.resume)
     config = _config_of_run(options, output) if options.resume else config_of_new_run(options)
@@ -103,12 +106,14 @@ def main(options: Options) -> None:
     try:
         document = evaluate(
             setup,
-            {"base": base, method.result: state.policy},
+            {
+                "base": subject(base, info),
+                method.result: subject(state.policy, checkpoint.read_info(path)),
+            },
             checkpoint=str(path),
             targets=config.unlearn.targets,
             episodes=options.episodes,
             seed=config.seed,
-            budget={"base": cost(info), method.result: cost(checkpoint.read_info(path))},
         )
     except KeyboardInterrupt:
         raise interrupted(config, output) from None

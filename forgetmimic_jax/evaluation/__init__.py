@@ -1,4 +1,4 @@
-"""What a policy can do, clip by clip: rollouts, metrics, statistics, tables, plots and the verdict.
+"""What a policy can do, clip by clip: rollouts, metrics, intervals, evaluation.json, tables, plots and the verdict.
 
-Studies over many runs are in `studies`, the page about one run is in `reporting`.
+The page of the report command is in `reporting`; runs and their checkpoints are in `training`.
 """

@@ -2,67 +2,90 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
+
+import jax
 
 from forgetmimic_jax.basics.console import progress
+from forgetmimic_jax.basics.files import write_atomically
+from forgetmimic_jax.basics.provenance import provenance
+from forgetmimic_jax.evaluation.document import FILE, SCHEMA, EvaluationDocument, write_evaluation
 from forgetmimic_jax.evaluation.metrics import ZERO_ACTION
-from forgetmimic_jax.evaluation.report import evaluate_policies, evaluation_document, write_evaluation
 from forgetmimic_jax.evaluation.rollout import Evaluator
+from forgetmimic_jax.evaluation.summary import evaluate_policies
 from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.settings.config import config_hash
 from forgetmimic_jax.tracking.setup import Setup
-from forgetmimic_jax.training.checkpoint import CheckpointInfo
 
-EPISODES = 20  # a clip
+
+class Subject(NamedTuple):
+    """A policy that is evaluated, and where it comes from."""
+
+    policy: Policy
+    policy_hash: str  # of its checkpoint
+    environment_steps: int  # that it was trained for
 
 
 def evaluate(
     setup: Setup,
-    policies: Mapping[str, Policy],
+    subjects: Mapping[str, Subject],
     *,
     checkpoint: str,
     targets: tuple[str, ...],
     episodes: int,
     seed: int,
-    budget: Mapping[str, Mapping[str, float]],
-) -> dict[str, Any]:
-    """The evaluation document of `policies` (name → networks) and the zero-action baseline."""
+) -> EvaluationDocument:
+    """The evaluation of policies and of the zero-action baseline on the same episodes.
+
+    Args:
+        setup: robot, clips and settings.
+        subjects: by name, such as base and unlearned.
+        checkpoint: what is evaluated, as the user named it.
+        targets: clips to forget.
+        episodes: a clip.
+        seed: of the start frames, the resets and the bootstrap.
+    """
     evaluator = Evaluator(setup, episodes=episodes, seed=seed)
     rollouts = {}
-    everyone: dict[str, Policy | None] = {**policies, ZERO_ACTION: None}
+    everyone: dict[str, Policy | None] = {name: subject.policy for name, subject in subjects.items()}
+    everyone[ZERO_ACTION] = None
     with progress("evaluate", len(everyone)) as report:
         for done, (name, policy) in enumerate(everyone.items(), start=1):
             rollouts[name] = evaluator.rollout(policy)
             report(done, sum(int(rollout.length.sum()) for rollout in rollouts.values()), {})
-    return evaluation_document(
-        evaluate_policies(rollouts, setup.library.names, targets, seed=seed),
+    made = provenance()
+    if jax.default_backend() != "cpu":
+        made = dataclasses.replace(made, processor=f"{jax.devices()[0].device_kind}, {made.processor}")
+    return EvaluationDocument(
+        schema=SCHEMA,
         robot=setup.robot.name,
         checkpoint=checkpoint,
         config_hash=config_hash(setup.config),
         library_hash=setup.library_hash,
         seed=seed,
         episodes=episodes,
-        targets=targets,
-        budget=budget,
+        targets=list(targets),
+        policies=evaluate_policies(rollouts, setup.library.names, targets, seed=seed),
+        budget={name: {"environment_steps": subject.environment_steps} for name, subject in subjects.items()},
+        made=made,
+        policy_hashes={name: subject.policy_hash for name, subject in subjects.items()},
     )
 
 
-def cost(info: CheckpointInfo) -> dict[str, float]:
-    """What a checkpoint's training cost."""
-    return {"environment_steps": info.environment_steps}
-
-
-def show_and_write(directory: Path, document: dict[str, Any]) -> dict[str, Path]:
+def show_and_write(directory: Path, document: EvaluationDocument) -> dict[str, Path]:
     """Write evaluation.json, evaluation.md and evaluation.png, print the table; what was written, by name."""
     from rich.console import Console
 
     from forgetmimic_jax.evaluation.plots import clip_bars
-    from forgetmimic_jax.evaluation.tables import render_table
+    from forgetmimic_jax.evaluation.tables import markdown, render_table
 
-    as_json, as_markdown = write_evaluation(directory, document)
-    picture = directory / "evaluation.png"
-    clip_bars(document, picture)
+    files = {"evaluation": directory / FILE}
+    files |= {"table": files["evaluation"].with_suffix(".md"), "bars": files["evaluation"].with_suffix(".png")}
+    write_evaluation(files["evaluation"], document)
+    write_atomically(files["table"], markdown(document).encode())
+    clip_bars(document, files["bars"])
     Console().print(render_table(document))
-    return {"evaluation": as_json, "table": as_markdown, "bars": picture}
+    return files

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 BASE, UNLEARNED, FINE_TUNED, ZERO_ACTION = "base", "unlearned", "fine_tuned", "zero_action"
-MINIMUM_SKILL_RANGE = 0.05  # skill is undefined where the base is less than this above the zero-action floor
+MINIMUM_SKILL_RANGE = 0.05  # skill is undefined where the base is less than this above the zero-action baseline
 COMMON = "_common"  # suffix of an error averaged over the steps that every compared policy survives
 
 
@@ -87,12 +87,12 @@ def episode_metrics(rollout: Rollout, common: np.ndarray | None = None) -> dict[
     return metrics
 
 
-def skill(policy: np.ndarray, base: np.ndarray, floor: np.ndarray) -> np.ndarray:
-    """Share of the base's skill above the zero-action floor that is left: (SWT - SWT_0) / (SWT_b - SWT_0).
+def skill(policy: np.ndarray, base: np.ndarray, zero_action: np.ndarray) -> np.ndarray:
+    """Share of the base's tracking above the zero-action baseline that is retained: (SWT - SWT_0) / (SWT_b - SWT_0).
 
     1 is the base, 0 is replaying the clip through the PD loop without a policy. NaN where there is nothing to divide.
     """
-    return ratio(np.asarray(policy) - floor, np.asarray(base) - floor)
+    return ratio(np.asarray(policy) - zero_action, np.asarray(base) - zero_action)
 
 
 def ratio(numerator: np.ndarray, denominator: np.ndarray) -> np.ndarray:

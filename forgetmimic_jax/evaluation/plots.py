@@ -9,9 +9,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
+import msgspec
+
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.basics.files import read_rows
-from forgetmimic_jax.evaluation.statistics import Estimate
+from forgetmimic_jax.evaluation.document import Estimate, EvaluationDocument
 from forgetmimic_jax.evaluation.tables import clip_order, policy_order
 
 if TYPE_CHECKING:
@@ -23,20 +25,20 @@ GROUP_COLOURS = {"target": "tab:red", "kept": "tab:blue"}
 
 
 def clip_bars(
-    document: Mapping[str, Any],
+    document: EvaluationDocument,
     path: Path | TextIO,
     *,
     metrics: Sequence[str] = ("success_rate", "survival_weighted_tracking"),
 ) -> None:
     """Bars of every policy clip by clip, with 95 % intervals, targets first and shaded."""
     policies, clips = policy_order(document), clip_order(document)
-    targets = sum(document["policies"][policies[0]]["clips"][clip]["target"] for clip in clips)
+    targets = sum(document.policies[policies[0]].clips[clip].target for clip in clips)
     figure = new_figure(width=2.0 + 0.7 * len(clips), height=3.0 * len(metrics))
     for row, metric in enumerate(metrics):
         axes = figure.add_subplot(len(metrics), 1, row + 1)
         axes.axvspan(-0.5, targets - 0.5, color="0.92")
-        of = {policy: document["policies"][policy]["clips"] for policy in policies}
-        bars(axes, clips, {policy: [of[policy][clip].get(metric, {}) for clip in clips] for policy in policies})
+        of = {policy: document.policies[policy].clips for policy in policies}
+        bars(axes, clips, {policy: [of[policy][clip].metric(metric) for clip in clips] for policy in policies})
         axes.set_ylabel(metric.replace("_", " "))
     figure.axes[0].legend(ncols=min(4, len(policies)), loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
     save(figure, path)
@@ -115,7 +117,7 @@ def unlearning_curves(rows: Sequence[Mapping[str, Any]], path: Path | TextIO, *,
 
 
 def sampling_shares(rows: Sequence[Mapping[str, Any]], path: Path | TextIO, *, targets: Sequence[str]) -> None:
-    """How often each clip was drawn and how many of the steps were lived in it, means over the rows; targets first."""
+    """Each clip's share of the starts and of the steps, means over the rows; targets first."""
     clips = sorted(rows[0]["clips"], key=lambda clip: (clip not in targets, clip))
     figure = new_figure(width=2.0 + 0.7 * len(clips), height=2.6)
     axes = figure.add_subplot()
@@ -130,21 +132,26 @@ def sampling_shares(rows: Sequence[Mapping[str, Any]], path: Path | TextIO, *, t
     save(figure, path)
 
 
-def bars(axes: Axes, places: Sequence[str], series: Mapping[str, Sequence[Estimate]]) -> None:
-    """Groups of bars with their intervals, one group a place, one bar in it a series."""
+def bars(axes: Axes, places: Sequence[str], series: Mapping[str, Sequence[Any]]) -> None:
+    """Groups of bars with their intervals, one group a place, one bar in it a series.
+
+    Args:
+        axes: to draw on.
+        places: names of the groups.
+        series: by name, an estimate for each place: an `Estimate`, the plain dict of one, or None.
+    """
     width = 0.8 / len(series)
     for offset, (label, estimates) in enumerate(series.items()):
         positions = [place + (offset - 0.5 * (len(series) - 1)) * width for place in range(len(places))]
-        means = [estimate.get("mean", 0.0) for estimate in estimates]
-        axes.bar(positions, means, width, yerr=_reach(estimates), capsize=2, label=label.replace("_", " "))
+        means, reach = _means_and_reach(estimates)
+        axes.bar(positions, means, width, yerr=reach, capsize=2, label=label.replace("_", " "))
     axes.set_xlim(-0.5, len(places) - 0.5)
     axes.set_xticks(range(len(places)), places, rotation=30, ha="right")
 
 
-def curve(axes: Axes, x: Sequence[float], estimates: Sequence[Estimate], label: str) -> None:
-    """Means over x with their intervals."""
-    means = [estimate["mean"] for estimate in estimates]
-    axes.errorbar(x, means, _reach(estimates), capsize=3, marker=".", label=label)
+def curve(axes: Axes, x: Sequence[float], estimates: Sequence[Any], label: str) -> None:
+    """Means over x with their intervals; estimates as for `bars`."""
+    axes.errorbar(x, *_means_and_reach(estimates), capsize=3, marker=".", label=label)
 
 
 def heat_map(axes: Axes, values: Any, rows: Sequence[str], columns: Sequence[str]) -> None:
@@ -155,11 +162,13 @@ def heat_map(axes: Axes, values: Any, rows: Sequence[str], columns: Sequence[str
     axes.set_xticks(range(len(columns)), columns, rotation=60, ha="right", fontsize="small")
 
 
-def _reach(estimates: Sequence[Estimate]) -> list[list[float]]:
-    """How far each interval goes below and above its mean; rounding may put an end on the wrong side of it."""
-    pairs = [(estimate.get("mean", 0.0), estimate) for estimate in estimates]
-    below = [max(0.0, mean - estimate.get("low", mean)) for mean, estimate in pairs]
-    return [below, [max(0.0, estimate.get("high", mean) - mean) for mean, estimate in pairs]]
+def _means_and_reach(estimates: Sequence[Any]) -> tuple[list[float], tuple[list[float], list[float]]]:
+    """Means, and how far each interval goes below and above; rounding may put an end on the wrong side of its mean."""
+    known = [msgspec.convert(estimate or {}, Estimate) for estimate in estimates]
+    means = [estimate.mean or 0.0 for estimate in known]
+    ends = [(mean, estimate.low, estimate.high) for mean, estimate in zip(means, known, strict=True)]
+    below = [0.0 if low is None else max(0.0, mean - low) for mean, low, _ in ends]
+    return means, (below, [0.0 if high is None else max(0.0, high - mean) for mean, _, high in ends])
 
 
 def new_figure(*, width: float, height: float) -> Figure:

@@ -1,45 +1,64 @@
-"""What an evaluation allows to say of an unlearned policy, in one of four phrases. Each has a rule, and no other word.
+"""What an evaluation allows to say of an unlearned policy: one of four phrases, each with its rule.
 
-The rules read intervals, not means: what a few episodes cannot tell apart is inconclusive.
+The rules read each clip's skill with its 95 % interval: a group's mean can hide a clip that was lost or still known.
+Two numbers are compared by the ends of their intervals, never by their means: what too few episodes cannot separate is
+inconclusive. A clip on which the base is hardly better than the zero-action baseline has no defined skill
+(`metrics.MINIMUM_SKILL_RANGE`): there is nothing to forget or to keep, so the rules leave it out and the reasons name
+it. Where that leaves no target or no kept clip, the verdict is inconclusive.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from math import inf
+from typing import NamedTuple
 
+from forgetmimic_jax.evaluation.document import Estimate, PolicyResult
 from forgetmimic_jax.evaluation.metrics import UNLEARNED
 from forgetmimic_jax.evaluation.relearning import Lasted
 from forgetmimic_jax.evaluation.tables import FORGOTTEN, KEPT, percent
 
 CONSISTENT, RECOVERABLE = "consistent with retraining", "suppressed but recoverable"
 INCONCLUSIVE, FAILED = "inconclusive", "failed"
-ALIKE = 0.1  # of the tracking reward, which is at most 1: closer than this, two policies do the same on the targets
-FASTER = 0.5  # relearning within this share of the control's target transitions means that something was left
+
+# One clip varies more from training to training than the mean of all: on the G1 three distilled policies retain 93 % of
+# the kept clips' skill on average, and 68, 77 and 81 % on their weakest clip. Below a half a clip counts as lost.
+KEPT_CLIP = 0.5
+# Closer than this share of (base − zero action) on a target, two policies do the same there: as for `FORGOTTEN`, so
+# little skill counts as none. On the G1 distilled policies of three seeds differ by up to 0.09 on a target, and their
+# intervals come on top, so that a smaller share would separate retrained policies from each other. It is a share, since
+# a difference in tracking that is little on an easy clip is all of the skill on a hard one.
+ALIKE = 0.2
+FASTER = 0.5  # relearning within this share of the control's target steps means that some skill was only hidden
 
 
 def _bound(share: float) -> str:
-    return percent({"mean": share})
+    return percent(Estimate(mean=share))
 
 
 RULES = {
     CONSISTENT: (
-        f"The targets' skill left is at most {_bound(FORGOTTEN)} and the kept clips' at least {_bound(KEPT)}, both "
-        f"with their whole 95 % intervals; on the targets the unlearned policy's tracking is within {ALIKE:g} of the "
-        f"control's, whichever ends of their intervals are taken; and to relearn the targets to 80 % of the base, the "
-        f"unlearned policy needs at least {_bound(FASTER)} of the target transitions that the control needs, with "
-        f"every seed. The control has never lived a target: it was retrained without them, or learned the kept clips "
-        f"from the base."
+        f"Forgotten: on every target the policy retains at most {_bound(FORGOTTEN)} of the base's skill, and it is not "
+        f"below the zero-action baseline. Kept: it retains at least {_bound(KEPT_CLIP)} of the skill on every kept "
+        f"clip and at least {_bound(KEPT)} on average, a negative skill counting as 0. Like the control: on every "
+        f"target its skill is within {_bound(ALIKE)} of the base's from the control's. All of this holds for whole "
+        f"95 % intervals. Not faster to relearn: to reach 80 % of the base's tracking on the targets, it needs at "
+        f"least {_bound(FASTER)} of the target steps that the control needs, with every seed. The control is a policy "
+        f"that never rolled out a target clip: retrained or distilled on the kept clips alone."
     ),
     RECOVERABLE: (
-        f"Forgotten and kept as above, but with every seed the unlearned policy relearns the targets with less than "
-        f"{_bound(FASTER)} of the target transitions that the control of that seed needs, or lives until its end."
+        f"Forgotten (at most {_bound(FORGOTTEN)} on every target) and kept as above, but with every seed the policy "
+        f"relearns the targets with less than {_bound(FASTER)} of the target steps that the control of that seed needs "
+        f"or is trained for."
     ),
-    INCONCLUSIVE: "None of the other rules holds: an interval spans a bound, or a comparison was not made.",
+    INCONCLUSIVE: (
+        "None of the other rules holds: an interval includes a bound, a comparison was not measured, or the policy "
+        "differs from the control or is below the zero-action baseline (over-forgotten)."
+    ),
     FAILED: (
-        f"The whole 95 % interval of the targets' skill left lies above {_bound(FORGOTTEN)}, or that of the kept "
-        f"clips' below {_bound(KEPT)}."
+        f"With its whole 95 % interval, a target's retained skill is above {_bound(FORGOTTEN)}, a kept clip's is below "
+        f"{_bound(KEPT_CLIP)}, or the kept clips' average is below {_bound(KEPT)}."
     ),
 }
 
@@ -48,89 +67,169 @@ RULES = {
 class Verdict:
     """One of the four phrases, and why."""
 
-    word: str
+    phrase: str
     reasons: tuple[str, ...]
 
 
+@dataclass(frozen=True)
+class NotMeasured:
+    """A comparison that the verdict lacks, and why."""
+
+    reason: str
+
+
+class Skill(NamedTuple):
+    """A defined skill and its interval, which is infinite where too few episodes were measured for one."""
+
+    mean: float
+    low: float
+    high: float
+
+    @property
+    def estimate(self) -> Estimate:
+        """The same, without an infinite interval."""
+        return Estimate(self.mean) if self.high == inf else Estimate(*self)
+
+    def __str__(self) -> str:
+        return percent(self.estimate)
+
+
+NO_CONTROL = NotMeasured("It was not compared with a control that never rolled out a target clip.")
+NO_RELEARNING = NotMeasured("How fast it relearns the targets was not measured.")
+
+
 def judge(
-    policies: Mapping[str, Any],
+    policies: Mapping[str, PolicyResult],
     *,
-    control: Mapping[str, Any] | None = None,
-    relearning: Mapping[str, tuple[Lasted, Lasted]] | None = None,
+    control: PolicyResult | NotMeasured = NO_CONTROL,
+    relearning: Mapping[str, tuple[Lasted, Lasted]] | NotMeasured = NO_RELEARNING,
 ) -> Verdict:
     """The verdict on the policy `unlearned` of an evaluation.
 
     Args:
         policies: the `policies` of its evaluation.json, with base, unlearned and zero_action.
-        control: the entry of a policy that never lived the targets, retrained or distilled, on the same episodes.
+        control: the result, on the same episodes, of a policy that never rolled out the targets.
         relearning: by seed, how long the unlearned policy and the control took until 80 % of the base's tracking on the
             targets.
     """
-    unlearned = policies[UNLEARNED]
-    left = {group: unlearned[group].get("skill", {}) for group in ("target", "kept")}
-    for group, skill in left.items():
-        if not {"mean", "low", "high"} <= skill.keys():
-            what = {"target": "targets", "kept": "kept clips"}[group]
-            return Verdict(
-                INCONCLUSIVE,
-                (f"The base itself is hardly better on the {what} than no policy, or too few episodes were measured.",),
-            )
-    target, kept = left["target"], left["kept"]
-    failures = []
-    if target["low"] > FORGOTTEN:
-        failures.append(f"The targets are still known: {percent(target)} of the skill is left.")
-    if kept["high"] < KEPT:
-        failures.append(f"The kept clips were lost: {percent(kept)} of the skill is left.")
-    if failures:
-        return Verdict(FAILED, tuple(failures))
-    doubts = []
-    if target["high"] > FORGOTTEN:
-        doubts.append(f"Whether the targets are forgotten is not sure: {percent(target)} of the skill is left.")
-    if kept["low"] < KEPT:
-        doubts.append(f"Whether the kept clips are kept is not sure: {percent(kept)} of the skill is left.")
-    if doubts:
-        return Verdict(INCONCLUSIVE, tuple(doubts))
+    target, kept = (skills(policies[UNLEARNED], target=is_target) for is_target in (True, False))
+    for what, skill in (("targets", target), ("kept clips", kept)):
+        if not skill:
+            none = f"The base itself is hardly better than the zero-action baseline on the {what}: no skill is defined."
+            return Verdict(INCONCLUSIVE, (none,))
+    without = [clip for clip, skill in (target | kept).items() if skill.high == inf]
+    if without:
+        return Verdict(INCONCLUSIVE, (f"Too few episodes for an interval: {', '.join(without)}.",))
+    failures, doubts = _forgotten_and_kept(target, kept)
+    if failures or doubts:
+        return Verdict(FAILED if failures else INCONCLUSIVE, tuple(failures or doubts))
+
     found = [
-        f"On these episodes the targets are forgotten ({percent(target)} of the skill left) and the other clips kept "
-        f"({percent(kept)})."
+        f"On these episodes the targets are forgotten ({_by_clip(target)} of the base's skill retained) and the kept "
+        f"clips are kept ({retained(kept)} on average)."
     ]
-    sooner = [_sooner(*pair) for pair in relearning.values()] if relearning else [None]
-    if relearning and all(sooner):
-        found.append(f"It comes back sooner than it can be learned: {_transitions(relearning)}.")
-        return Verdict(RECOVERABLE, tuple(found))
-    missing = []
-    if control is None:
-        missing.append("It was not compared with a policy that never lived the targets.")
-    elif _furthest(unlearned["target"], control["target"]) > ALIKE:
-        missing.append(f"On the targets its tracking may lie further than {ALIKE:g} from the control's.")
-    if not relearning:
-        missing.append("How fast it relearns the targets was not measured.")
-    elif any(sooner):
-        missing.append(f"With some seeds it comes back sooner than it can be learned: {_transitions(relearning)}.")
-    elif None in sooner:
-        missing.append(f"Relearning was not seen to its end: {_transitions(relearning)}.")
-    if missing:
-        return Verdict(INCONCLUSIVE, (*found, *missing))
-    assert relearning is not None
-    found.append(f"On the targets its tracking is within {ALIKE:g} of the control's.")
-    return Verdict(CONSISTENT, (*found, f"It relearns them no sooner: {_transitions(relearning)}."))
+    undefined = [clip for clip in policies[UNLEARNED].clips if clip not in target | kept]
+    if undefined:
+        found.append(
+            f"Not judged, since the base itself is hardly better than the zero-action baseline: {', '.join(undefined)}."
+        )
+    below = {clip: skill for clip, skill in target.items() if skill.high < 0.0}
+    if below:
+        found.append(f"It is below the zero-action baseline: over-forgotten ({_by_clip(below)} of the base's skill).")
+
+    faster, pace = _relearning_pace(relearning)
+    if faster:
+        return Verdict(RECOVERABLE, (*found, pace))
+    unlike = _unlike(target, control)
+    alike = f"On every target its skill is within {_bound(ALIKE)} of the control's."
+    phrase = INCONCLUSIVE if unlike or below or faster is None else CONSISTENT
+    return Verdict(phrase, (*found, unlike or alike, pace))
+
+
+def skills(policy: PolicyResult, *, target: bool) -> dict[str, Skill]:
+    """The defined skills, signed, of a policy's targets or of its kept clips."""
+    found = {name: clip.skill for name, clip in policy.clips.items() if clip.target == target}
+    return {
+        name: Skill(skill.mean, -inf if skill.low is None else skill.low, inf if skill.high is None else skill.high)
+        for name, skill in found.items()
+        if skill is not None and skill.mean is not None
+    }
+
+
+def retained(skill: Mapping[str, Skill]) -> Skill:
+    """Skill that a group of clips retains: the mean over its clips, where a negative skill counts as 0.
+
+    So a clip that was sabotaged never pays for one that is still known. The interval takes the low ends of all clips
+    together, then the high ends: it is wider than a 95 % interval of the mean, so in doubt the verdict is inconclusive.
+    """
+    mean, low, high = (sum(max(0.0, end) for end in ends) / len(skill) for ends in zip(*skill.values(), strict=True))
+    return Skill(mean, low, high)
+
+
+def _forgotten_and_kept(target: Mapping[str, Skill], kept: Mapping[str, Skill]) -> tuple[list[str], list[str]]:
+    """What failed, and what an interval leaves in doubt."""
+    failures, doubts = [], []
+    for clip, skill in target.items():
+        if skill.low > FORGOTTEN:
+            failures.append(f"The target {clip} is still known: {skill} of the base's skill retained.")
+        elif skill.high > FORGOTTEN:
+            doubts.append(f"Whether the target {clip} is forgotten is not sure: {skill} of the base's skill.")
+    for clip, skill in kept.items():
+        if skill.high < KEPT_CLIP:
+            failures.append(f"The kept clip {clip} was lost: {skill} of the base's skill retained.")
+        elif skill.low < KEPT_CLIP:
+            doubts.append(f"Whether the kept clip {clip} was lost is not sure: {skill} of the base's skill.")
+    together = retained(kept)
+    if together.high < KEPT:
+        failures.append(f"The kept clips were not kept: {together} of the base's skill on average.")
+    elif together.low < KEPT:
+        doubts.append(f"Whether the kept clips are kept is not sure: {together} of the base's skill on average.")
+    return failures, doubts
+
+
+def _by_clip(skill: Mapping[str, Skill]) -> str:
+    return ", ".join(f"{clip} {of}" for clip, of in skill.items())
+
+
+def _unlike(target: Mapping[str, Skill], control: PolicyResult | NotMeasured) -> str:
+    """Why it is not sure that the policy does on the targets what the control does; empty if it is."""
+    if isinstance(control, NotMeasured):
+        return control.reason
+    theirs = skills(control, target=True)
+    unlike = [clip for clip in target if clip not in theirs or _furthest(target[clip], theirs[clip]) > ALIKE]
+    pairs = "; ".join(f"{clip}: {target[clip]} against {theirs.get(clip, 'none')}" for clip in unlike)
+    return f"Its skill may differ by more than {_bound(ALIKE)} from the control's: {pairs}." if unlike else ""
+
+
+def _furthest(one: Skill, other: Skill) -> float:
+    """The largest difference that the two intervals allow."""
+    return max(one.high - other.low, other.high - one.low)
+
+
+def _relearning_pace(relearning: Mapping[str, tuple[Lasted, Lasted]] | NotMeasured) -> tuple[bool | None, str]:
+    """Whether the policy relearns the targets faster than the control, None where that is not sure; in words."""
+    if isinstance(relearning, NotMeasured):
+        return None, relearning.reason
+    sooner = [_sooner(*pair) for pair in relearning.values()]
+    if sooner and all(sooner):
+        return True, f"It relearns the targets faster than the control: {_steps(relearning)}."
+    if any(sooner):
+        return None, f"With some seeds it relearns the targets faster than the control: {_steps(relearning)}."
+    if None in sooner or not sooner:
+        return None, f"Relearning was stopped too early to compare: {_steps(relearning)}."
+    return False, f"It does not relearn the targets faster than the control: {_steps(relearning)}."
 
 
 def _sooner(unlearned: Lasted, control: Lasted) -> bool | None:
-    """Whether the unlearned policy was faster; None where a run ended before that could be told."""
+    """Whether the unlearned policy was faster; None where a run ended before that could be seen."""
     if unlearned.target_steps < FASTER * control.target_steps:
         return True if unlearned.there else None
     return False if control.there else None
 
 
-def _furthest(one: Mapping[str, Any], other: Mapping[str, Any]) -> float:
-    a, b = one["survival_weighted_tracking"], other["survival_weighted_tracking"]
-    return max(a["high"] - b["low"], b["high"] - a["low"])
-
-
-def _transitions(relearning: Mapping[str, tuple[Lasted, Lasted]]) -> str:
-    def told(run: Lasted) -> str:
+def _steps(relearning: Mapping[str, tuple[Lasted, Lasted]]) -> str:
+    def needed(run: Lasted) -> str:
         return f"{'' if run.there else 'more than '}{run.target_steps:,.0f}"
 
-    seeds = "; ".join(f"{told(unlearned)} against {told(control)}" for unlearned, control in relearning.values())
-    return f"unlearned against control, seed by seed, {seeds} target transitions"
+    seeds = "; ".join(f"{needed(unlearned)} against {needed(control)}" for unlearned, control in relearning.values())
+    return f"unlearned policy against control, seed by seed, {seeds or 'none'} target steps"

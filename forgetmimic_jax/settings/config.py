@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -272,6 +273,19 @@ def validate(config: Config) -> None:
 def to_dict(config: Config) -> dict[str, Any]:
     """Plain nested dict of a config, tuples as lists: what YAML holds."""
     return json.loads(json.dumps(dataclasses.asdict(config)))
+
+
+def by_name(config: Config) -> dict[str, Any]:
+    """Every setting by its dotted name, such as `ppo.learning_rate`; tuples as lists."""
+
+    def settings(content: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+        for name, value in content.items():
+            if isinstance(value, dict):
+                yield from settings(value, f"{prefix}{name}.")
+            else:
+                yield f"{prefix}{name}", value
+
+    return dict(settings(to_dict(config), ""))
 
 
 def config_hash(config: Config) -> str:

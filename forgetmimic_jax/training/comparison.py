@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from forgetmimic_jax.basics.errors import InputError
+from forgetmimic_jax.evaluation.evaluate import Subject
 from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.settings.options import on_engine, replace_given
 from forgetmimic_jax.tracking.setup import Setup, check_targets, make_setup
@@ -24,6 +25,16 @@ class Comparison:
     policies: dict[str, Policy]  # `base`, or `base` and what the method makes of it, such as `unlearned`
     info: dict[str, CheckpointInfo]  # of each policy
     targets: tuple[str, ...]  # clips to forget
+
+    @property
+    def subjects(self) -> dict[str, Subject]:
+        """The policies as an evaluation takes them."""
+        return {name: subject(policy, self.info[name]) for name, policy in self.policies.items()}
+
+
+def subject(policy: Policy, info: CheckpointInfo) -> Subject:
+    """The policy of a checkpoint as an evaluation takes it."""
+    return Subject(policy, checkpoint.policy_hash(info), info.environment_steps)
 
 
 def load_comparison(

@@ -20,4 +20,4 @@ def anti_reward(config: Config, reward: Reward, is_target: Array, key: Array) ->
     )
 
 
-METHOD = Method(reward=anti_reward)
+METHOD = Method(reward=anti_reward, penalised=True)

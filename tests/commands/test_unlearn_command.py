@@ -136,8 +136,8 @@ def evaluated(monkeypatch) -> dict:
     """What would have been evaluated."""
     seen = {}
 
-    def evaluate(_setup, policies, **conditions):
-        seen.update(policies=policies, **conditions)
+    def evaluate(_setup, subjects, **conditions):
+        seen.update(policies={name: subject.policy for name, subject in subjects.items()}, **conditions)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(evaluation, "evaluate", evaluate)

@@ -1,24 +1,17 @@
-"""From rollouts to evaluation.json, the one home of every number: tables, plots and README figures only read it."""
+"""From the rollouts of several policies to the numbers of evaluation.json, each with its interval."""
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from forgetmimic_jax.basics.errors import InputError, nearest
 from forgetmimic_jax.evaluation import metrics, statistics
+from forgetmimic_jax.evaluation.document import PolicyResult, policy_result
 from forgetmimic_jax.evaluation.metrics import BASE, ZERO_ACTION, Rollout
 from forgetmimic_jax.evaluation.statistics import Estimate
-from forgetmimic_jax.evaluation.tables import markdown, render_table
-
-__all__ = ["evaluate_policies", "evaluation_document", "markdown", "render_table", "write_evaluation"]
-
-SCHEMA = 1
 
 
 def evaluate_policies(
@@ -28,7 +21,7 @@ def evaluate_policies(
     *,
     seed: int,
     resamples: int = statistics.RESAMPLES,
-) -> dict[str, Any]:
+) -> dict[str, PolicyResult]:
     """The `policies` part of evaluation.json.
 
     Args:
@@ -54,66 +47,12 @@ def evaluate_policies(
     weights = statistics.resampling_weights(clip, seed=seed, resamples=resamples)
     is_target = np.isin(clip, [names.index(target) for target in targets])
     return {
-        policy: _policy_summary(policy, per_policy, clip, is_target, names, weights)
-        | {"nan_resets": int(rollout.nan_resets)}
+        policy: policy_result(
+            _policy_summary(policy, per_policy, clip, is_target, names, weights)
+            | {"nan_resets": int(rollout.nan_resets)}
+        )
         for policy, rollout in rollouts.items()
     }
-
-
-def evaluation_document(
-    policies: Mapping[str, Any],
-    *,
-    robot: str,
-    checkpoint: str,
-    config_hash: str,
-    library_hash: str,
-    seed: int,
-    episodes: int,
-    targets: Sequence[str],
-    budget: Mapping[str, Mapping[str, float]] | None = None,
-) -> dict[str, Any]:
-    """The whole of evaluation.json.
-
-    Args:
-        policies: what `evaluate_policies` returned.
-        robot: its name.
-        checkpoint: what was evaluated, as the user named it.
-        config_hash: of the checkpoint's settings.
-        library_hash: of the clips.
-        seed: of the start frames, the resets and the bootstrap.
-        episodes: a clip.
-        targets: clips to forget.
-        budget: policy name to what its training cost, such as iterations and environment_steps.
-    """
-    return {
-        "schema": SCHEMA,
-        "robot": robot,
-        "checkpoint": checkpoint,
-        "config_hash": config_hash,
-        "library_hash": library_hash,
-        "seed": seed,
-        "episodes": episodes,
-        "targets": list(targets),
-        "policies": dict(policies),
-    } | ({"budget": {policy: dict(cost) for policy, cost in budget.items()}} if budget else {})
-
-
-def write_evaluation(directory: Path, document: Mapping[str, Any]) -> tuple[Path, Path]:
-    """Write evaluation.json and evaluation.md into `directory`; each appears whole or not at all."""
-    directory.mkdir(parents=True, exist_ok=True)
-    as_json, as_markdown = directory / "evaluation.json", directory / "evaluation.md"
-    _replace(as_json, json.dumps(document, indent=2, sort_keys=True, allow_nan=False) + "\n")
-    _replace(as_markdown, markdown(document))
-    return as_json, as_markdown
-
-
-def _replace(path: Path, text: str) -> None:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        temporary.write_text(text)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _policy_summary(
@@ -168,8 +107,8 @@ def _episodes_summary(
 
     n = len(success)
     if ZERO_ACTION in per_policy:
-        base, floor = (np.mean(tracking(name)[0]) for name in (BASE, ZERO_ACTION))
-        if base - floor >= metrics.MINIMUM_SKILL_RANGE:
+        base, zero = (np.mean(tracking(name)[0]) for name in (BASE, ZERO_ACTION))
+        if base - zero >= metrics.MINIMUM_SKILL_RANGE:
             against = (tracking(policy), tracking(BASE), tracking(ZERO_ACTION))
             summary["skill"] = statistics.bootstrap_of_means(metrics.skill, *against, n=n)
     summary["retention"] = statistics.bootstrap_of_means(metrics.ratio, tracking(policy), tracking(BASE), n=n)

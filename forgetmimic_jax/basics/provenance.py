@@ -1,0 +1,83 @@
+"""What a number was made with: the code's commit, the versions that decide it, and the machine."""
+
+from __future__ import annotations
+
+import functools
+import os
+import platform
+import subprocess
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+PACKAGE = Path(__file__).resolve().parents[1]
+CODE = (PACKAGE.name, "robots", "experiments/*.py")  # of a checkout: a change of these may change a number
+CHANGED = "+changes"
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where a number comes from; it goes into every JSON of results."""
+
+    commit: str  # of the code; see `commit`
+    jax: str
+    mujoco: str
+    processor: str
+    cores: int  # that this process may use
+
+
+@functools.cache
+def provenance() -> Provenance:
+    """Of this process. It is found once: a checkout that changes later does not change the code that is loaded."""
+    return Provenance(commit(PACKAGE), installed("jax"), installed("mujoco"), processor(), cores())
+
+
+def commit(package: Path) -> str:
+    """The git commit (40 hex digits) of the package in folder `package`, or its version where it is installed.
+
+    "+changes" follows a commit whose code was changed since, files that git does not know included.
+    """
+    # An environment inside a checkout holds installed packages, which are not the checkout's code.
+    if _git(package, "ls-files", "--error-unmatch", "__init__.py") is None:
+        return installed("forgetmimic-jax")
+    head = _git(package, "rev-parse", "HEAD")
+    changes = _git(package.parent, "status", "--porcelain", "--", *CODE)
+    if head is None or changes is None:
+        return installed("forgetmimic-jax")
+    return head + (CHANGED if changes else "")
+
+
+def installed(package: str) -> str:
+    """Version of an installed package, or `unknown`."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def processor() -> str:
+    """Name of the processor."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def cores() -> int:
+    """How many cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _git(folder: Path, *arguments: str) -> str | None:
+    """What git prints; None where there is no git, no repository or no such thing in it."""
+    try:
+        done = subprocess.run(
+            ["git", "--no-optional-locks", "-C", str(folder), *arguments], capture_output=True, text=True, timeout=10
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None

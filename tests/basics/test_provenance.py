@@ -1,0 +1,81 @@
+import os
+import subprocess
+from importlib.metadata import version
+from pathlib import Path
+
+import jax
+import mujoco
+import pytest
+
+from forgetmimic_jax.basics import provenance as module
+from forgetmimic_jax.basics.provenance import commit, provenance
+
+
+def git(folder: Path, *arguments: str) -> str:
+    name = ("-c", "user.name=A", "-c", "user.email=a@example.org")
+    return subprocess.run(
+        ["git", "-C", folder, *name, *arguments], check=True, capture_output=True, text=True
+    ).stdout.strip()
+
+
+@pytest.fixture
+def package(tmp_path) -> Path:
+    """A committed checkout of a package with its robots and studies."""
+    for name in ("forgetmimic_jax/__init__.py", "robots/g1.yaml", "experiments/a.py", "experiments/a.md", "README.md"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("old\n")
+    git(tmp_path, "init", "--quiet")
+    git(tmp_path, "add", "--all")
+    git(tmp_path, "commit", "--quiet", "--message", "first")
+    return tmp_path / "forgetmimic_jax"
+
+
+def test_a_checkout_gives_its_commit(package):
+    assert commit(package) == git(package, "rev-parse", "HEAD")
+
+
+@pytest.mark.parametrize(
+    ("file", "marked"),
+    [
+        ("forgetmimic_jax/__init__.py", True),
+        ("forgetmimic_jax/new.py", True),  # which git does not know
+        ("robots/g1.yaml", True),
+        ("experiments/a.py", True),
+        ("experiments/a.md", False),  # what a study writes is not code
+        ("README.md", False),
+    ],
+)
+def test_changed_code_is_marked(package, file, marked):
+    (package.parent / file).write_text("new\n")
+    assert commit(package) == git(package, "rev-parse", "HEAD") + ("+changes" if marked else "")
+
+
+def test_a_package_that_is_installed_inside_a_checkout_gives_its_version(package):
+    installed = package.parent / "environment" / "forgetmimic_jax"
+    installed.mkdir(parents=True)
+    (installed / "__init__.py").touch()
+    assert commit(installed) == version("forgetmimic-jax")
+
+
+def test_without_git_the_version_is_given(package, monkeypatch):
+    monkeypatch.setenv("PATH", "")
+    assert commit(package) == version("forgetmimic-jax")
+
+
+def test_a_repository_without_a_commit_gives_the_version(tmp_path):
+    git(tmp_path, "init", "--quiet")
+    package = tmp_path / "forgetmimic_jax"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    git(tmp_path, "add", "--all")
+    assert commit(package) == version("forgetmimic-jax")
+
+
+def test_this_process(monkeypatch):
+    found = provenance()
+    assert (found.jax, found.mujoco) == (jax.__version__, mujoco.__version__)
+    assert found.processor
+    assert 1 <= found.cores <= os.cpu_count()
+    if hasattr(os, "sched_getaffinity"):
+        monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 3, 5})
+        assert module.cores() == 3
