@@ -207,9 +207,8 @@ class Config:
     unlearn: UnlearnConfig = field(default_factory=UnlearnConfig)
 
 
-# What a preset changes of the paper's settings. `cpu` is what trains best on a laptop's cores
-# (experiments/base_policy.md): without randomisation, since evaluation has none either and a laptop's budget is better
-# spent on the motions.
+# What a preset changes of the paper's settings. `cpu` is what trains best on a laptop's cores (docs/findings.md):
+# without randomisation, since evaluation has none either and a laptop's budget is better spent on the motions.
 PRESETS: dict[str, dict[str, Any]] = {
     "paper": {},
     "cpu": {

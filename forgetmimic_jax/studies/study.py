@@ -62,7 +62,7 @@ class Options:
     episodes: int = 20
     """Evaluation episodes a clip."""
     jobs: int = 2
-    """Trials at a time; each of them uses all cores of a CPU (experiments/parallel_trials.py)."""
+    """Trials at a time; each of them uses all cores of a CPU (docs/findings.md)."""
     trials: Path = Path("runs/trials")
     """Folder of the trials, in which every study finds the finished ones again."""
     physics: Literal["auto", "native", "mjx", "mjx-warp"] | None = None
@@ -371,7 +371,7 @@ def page(study: Study, document: Mapping[str, Any]) -> str:
     episodes = watched_episodes(asked["episodes"]) if study.watches else asked["episodes"]
     on_laptop = (
         "- Unlearning with the cpu budget holds the kept clips to the base (an anchor), weighs all clips the same and "
-        "gives the targets half of the starts (`experiments/pace.md`); the paper's has none of it, nor do rows called "
+        "gives the targets half of the starts (`docs/findings.md`); the paper's has none of it, nor do rows called "
         "plain PPO."
     )
     lines = [
@@ -423,22 +423,6 @@ def variants_study(
         tell=tell or (lambda document: variant_table(document["results"]["variants"], theirs)),
         draw=draw or (lambda document: variant_bars(document["results"]["variants"])),
     )
-
-
-def measured_page(measure: Callable[[], Any], page: Callable[[Any], str], result: Path, path: Path) -> None:
-    """The command of a measurement without trials: its numbers, unless `--draw` is given, and from them its page."""
-    if "--draw" not in sys.argv[1:]:
-        write_atomically(result, (json.dumps(measure(), indent=1) + "\n").encode())
-    write_atomically(path, page(json.loads(result.read_text())).encode())
-    print(f"numbers  {result}\npage     {path}")
-
-
-def named_policy() -> Path:
-    """The checkpoint on a measurement's command line, or the shipped base of the G1."""
-
-    from forgetmimic_jax.training.start import base_folder
-
-    return Path(sys.argv[1]) if sys.argv[1:] else base_folder("g1")
 
 
 def main(study: Study, options: type[Options] = Options, arguments: Iterable[str] | None = None) -> None:
