@@ -240,37 +240,41 @@ MUTANTS = (
            ""),
     Mutant("verdict_lost_clip", "forgetmimic_jax/evaluation/verdict.py", "tests/evaluation/test_verdict.py",
            "A kept clip that was lost hides in the mean of the others.",
-           'if skill["high"] < KEPT_CLIP:',
-           'if skill["high"] < -1.0:'),
+           "if skill.high < KEPT_CLIP:",
+           "if skill.high < -1.0:"),
     Mutant("verdict_target", "forgetmimic_jax/evaluation/verdict.py", "tests/evaluation/test_verdict.py",
            "A target counts as forgotten although its interval goes beyond the bound.",
-           'elif skill["high"] > FORGOTTEN:',
-           'elif skill["mean"] > FORGOTTEN:'),
+           "elif skill.high > FORGOTTEN:",
+           "elif skill.mean > FORGOTTEN:"),
     Mutant("verdict_negative", "forgetmimic_jax/evaluation/verdict.py", "tests/evaluation/test_verdict.py",
            "A negative skill on one clip pays for another.",
-           "sum(max(0.0, of[end]) for of in skill.values())",
-           "sum(of[end] for of in skill.values())"),
+           "sum(max(0.0, end) for end in ends)",
+           "sum(ends)"),
+    Mutant("verdict_below", "forgetmimic_jax/evaluation/verdict.py", "tests/evaluation/test_verdict.py",
+           "A policy below the zero-action baseline can be consistent with retraining.",
+           "for clip, skill in target.items() if skill.high < 0.0}",
+           "for clip, skill in target.items() if skill.high < -inf}"),
     # Studies.
-    Mutant("membership_twins", "experiments/membership.py", "tests/commands/test_studies.py",
+    Mutant("membership_twins", "experiments/membership.py", "tests/experiments/test_measures.py",
            "Clips and their mirror images are exchanged.",
            "features(rollout, twins[key])",
            "features(twins[key], rollout)"),
-    Mutant("membership_asked", "experiments/membership.py", "tests/commands/test_studies.py",
+    Mutant("membership_asked", "experiments/membership.py", "tests/experiments/test_measures.py",
            "The attack learns on the targets and is asked about the kept clips.",
            "for mask in (~is_target, is_target))",
            "for mask in (is_target, ~is_target))"),
-    Mutant("relearning_base", "experiments/relearning.py", "tests/commands/test_studies.py",
+    Mutant("relearning_base", "experiments/relearning.py", "tests/experiments/test_measures.py",
            "Relearning is measured against the unlearned policy, not the base.",
-           '_tracking(at_first["base"], lab.targets)',
-           '_tracking(at_first["unlearned"], lab.targets)'),
-    Mutant("relearning_clips", "experiments/relearning.py", "tests/commands/test_studies.py",
+           'first["base"], lab.targets)',
+           'first["unlearned"], lab.targets)'),
+    Mutant("relearning_clips", "experiments/relearning.py", "tests/experiments/test_measures.py",
            "Relearning starts from kept clips only.",
            'watched = {"clips": "all", ',
            'watched = {"clips": "kept", '),
-    Mutant("relearning_anchor", "experiments/relearning.py", "tests/commands/test_studies.py",
+    Mutant("relearning_anchor", "experiments/relearning.py", "tests/experiments/test_measures.py",
            "Relearning is held to the policy that it starts from.",
            '"schedule": "fixed", "anchor": 0.0}',
-           '"schedule": "fixed"}'),
+           '"schedule": "fixed", "anchor": 1.0}'),
 )
 # fmt: on
 
@@ -290,7 +294,7 @@ def main(arguments: list[str] | None = None) -> int:
         if name not in by_name:
             parser.error(f"no mutant '{name}'; --list names them")
     chosen = [by_name[name] for name in asked.only or by_name]
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else 140)
     if asked.list:
         outdated = {mutant: told for mutant in chosen if (told := misfit(mutant, ROOT))}
         console.print(table({mutant: outdated.get(mutant, "") for mutant in chosen}))

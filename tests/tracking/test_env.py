@@ -235,6 +235,12 @@ def test_a_fall_is_a_termination_even_in_the_last_step(puppet_env, assets):
     np.testing.assert_array_equal(result.causes["anchor_height"], [False, True, False, False])
 
 
+def test_the_frame_shown_is_the_one_that_the_next_action_is_to_reach(puppet_env, assets):
+    state = start(puppet_env, assets, [0, 0, 1, 1], [0, 5, 9, 38])
+    shown = tracking.observe(puppet_env, assets, state, None)[0][:, 10:39]
+    np.testing.assert_allclose(shown, rows(assets.library, [0, 0, 1, 1], [1, 6, 10, 39], "joint_pos"), atol=1e-6)
+
+
 def test_after_a_clips_end_the_last_frame_is_shown(puppet_env, assets):
     state = start(puppet_env, assets, [1] * ENVS, [39] * ENVS)
     state, _ = follow(puppet_env, assets, state)
