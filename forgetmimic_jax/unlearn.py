@@ -40,8 +40,8 @@ class Options:
     arft (the paper's), distill, retrain, finetune,
     random_reward, negated_reward, gradient_ascent,
     trajdeleter, poisoning, decremental or policy_edit."""
-    penalty: float = 16.0
-    """Penalty λ of arft on the targets' normalised tracking reward; W = 8 is the paper's edge."""
+    penalty: float | None = None
+    """Penalty λ of arft on the targets' normalised tracking reward; 16 by default. The paper's threshold is W = 8."""
     sampler: Literal["uniform_clips", "uniform_bins", "frozen", "adaptive"] | None = None
     """How starts are drawn; frozen: as the base's last ones. uniform_clips by default, for retrain the base's own."""
     wrench: bool = False
@@ -96,12 +96,11 @@ def main(options: Options) -> None:
     base = base_policy(setup)
     setup = dataclasses.replace(setup, base=base)
     info = checkpoint.read_info(base_checkpoint(config))
-    description = f"forget {', '.join(config.unlearn.targets)}"
     method = method_of(config)
     if method.result == "fine_tuned" and config.sampling.clips == "all":
         description = "fine-tune on all clips"  # which is no forgetting
-    elif config.unlearn.method != UnlearnConfig.method:
-        description += f" by {config.unlearn.method}"
+    else:
+        description = f"forget {', '.join(config.unlearn.targets)} by {config.unlearn.method}"
     path, state = run(setup, output, description=description, resume=options.resume)
     try:
         document = evaluate(
@@ -134,8 +133,8 @@ def config_of_new_run(options: Options) -> Config:
     config = dataclasses.replace(config, base=None, evaluate_every=0)
     config = replace_given(config, robot=options.robot, seed=options.seed, library=options.library, base=options.base)
     targets = default_targets(config) if options.targets is None else comma_separated(options.targets)
-    unlearn = UnlearnConfig(targets=targets, penalty=options.penalty, method=options.method)
-    config = unlearning_config(config, unlearn)
+    settings = {} if options.penalty is None else {"penalty": options.penalty}
+    config = unlearning_config(config, UnlearnConfig(targets, options.method, settings))
     pace = find_method(options.method).pace
     config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, **pace.ppo.get(config.preset, {})))
     sampling = replace_given(config.sampling, rule=options.sampler, clips=options.clips)
@@ -171,7 +170,8 @@ def _config_of_run(options: Options, output: Path) -> Config:
         options = dataclasses.replace(options, targets=",".join(comma_separated(options.targets)))
     check_same(options, {name: getattr(config, name) for name in ("robot", "preset", "seed", "library", "base")})
     unlearn, sampling = config.unlearn, config.sampling
-    check_same(options, {"targets": ",".join(unlearn.targets), "penalty": unlearn.penalty, "method": unlearn.method})
+    check_same(options, {"targets": ",".join(unlearn.targets), "method": unlearn.method})
+    check_same(options, {"penalty": unlearn.settings.get("penalty")})
     check_same(options, {"sampler": sampling.rule, "clips": sampling.clips, "wrench": config.wrench.max_gain > 0})
     return config
 

@@ -119,8 +119,8 @@ MUTANTS = (
     # Losses and methods.
     Mutant("penalty_sign", "forgetmimic_jax/unlearning/arft.py", "tests/unlearning/test_arft.py",
            "The anti-reward pays for tracking the targets.",
-           "- config.unlearn.penalty *",
-           "+ config.unlearn.penalty *"),
+           "- penalty * reward",
+           "+ penalty * reward"),
     Mutant("kl", "forgetmimic_jax/policy/gaussian.py", "tests/policy/test_network.py",
            "The divergence of two Gaussians has their variances the wrong way round.",
            "variance_ratio = jnp.exp(2.0 * (log_std - new_log_std))",

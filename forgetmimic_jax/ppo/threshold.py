@@ -12,7 +12,7 @@ from forgetmimic_jax.tracking.reward import total_tracking_weight
 def threshold_metrics(
     config: Config, is_target: Array, steps: Array, tracking: Array, regularisation: Array, normalized: Array
 ) -> dict[str, Array]:
-    """R̄_track, R̄_reg and λ_crit = W (1 + R̄_reg / R̄_track), apart for target and kept steps; for `arft` also R̄_anti.
+    """R̄_track, R̄_reg and λ_crit = W (1 + R̄_reg / R̄_track), apart for target and kept steps; with a penalty also R̄_anti.
 
     λ_crit is where the mean reward of a target step changes its sign; W alone leaves R_reg out.
 
@@ -38,7 +38,7 @@ def threshold_metrics(
             f"{group}/tracking_reward": (normalized * mask).sum() / count,
             f"{group}/lambda_crit": weight * (1.0 + mean_regularisation / jnp.maximum(mean_tracking, 1e-6)),
         }
-        if config.unlearn.method == "arft":
+        if penalty := config.unlearn.settings.get("penalty"):
             on_target = group == "target"
-            metrics[f"{group}/R_anti"] = -config.unlearn.penalty * metrics[f"{group}/tracking_reward"] * on_target
+            metrics[f"{group}/R_anti"] = -penalty * metrics[f"{group}/tracking_reward"] * on_target
     return metrics

@@ -26,7 +26,14 @@ from forgetmimic_jax.training.checkpoint import policy_hash
 from forgetmimic_jax.unlearning.registry import find_method, method_of, methods
 
 RELEARNED = 0.8  # of the base's tracking on the targets
-FIRST = ("robot", "unlearn.method", "unlearn.targets", "unlearn.penalty", "iterations", "preset")  # named before others
+FIRST = (
+    "robot",
+    "unlearn.method",
+    "unlearn.targets",
+    "unlearn.settings.penalty",
+    "iterations",
+    "preset",
+)  # named before others
 COMPETENT = f"a control needs at least {100 * KEPT:.0f} % of it, with its whole interval"
 
 

@@ -16,7 +16,6 @@ from forgetmimic_jax.evaluation.tables import number, percent
 from forgetmimic_jax.evaluation.verdict import NotMeasured
 from forgetmimic_jax.reporting.subject import Subject
 from forgetmimic_jax.training.checkpoint import policy_hash
-from forgetmimic_jax.unlearning.registry import method_of
 
 PACKAGES = ("forgetmimic-jax", "jax", "mujoco", "numpy", "flax", "optax")
 
@@ -36,8 +35,7 @@ def done(subject: Subject) -> dict[str, str]:
     config, document, base = subject.info.config, subject.document, subject.base
     module = importlib.import_module(f"{unlearning.__name__}.{config.unlearn.method}")
     facts = {"Method": f"{config.unlearn.method}: {str(module.__doc__).splitlines()[0]}"}
-    if method_of(config).penalised:
-        facts["Penalty λ"] = f"{config.unlearn.penalty:g}"
+    facts |= {name.capitalize(): f"{value:g}" for name, value in config.unlearn.settings.items()}
     steps = document.budget.get(UNLEARNED, {}).get("environment_steps", subject.info.environment_steps)
     return facts | {
         "Budget": f"{subject.info.iteration:,} iterations, {steps:,.0f} environment steps, {config.ppo.num_envs} "
@@ -87,10 +85,10 @@ def threshold(subject: Subject) -> str:
         f"λ_crit = W (1 + R_reg / R_track) is the penalty above which a mean step on a target clip costs more reward "
         f"than it brings. On the targets it was {found:.1f} on average."
     )
-    if not method_of(config).penalised:
+    if "penalty" not in config.unlearn.settings:
         return text
-    side = "above" if config.unlearn.penalty > found else "not above"
-    return f"{text} The λ of this run, {config.unlearn.penalty:g}, is {side} it."
+    penalty = config.unlearn.settings["penalty"]
+    return f"{text} The λ of this run, {penalty:g}, is {'above' if penalty > found else 'not above'} it."
 
 
 def _mean_lambda_crit(rows: Sequence[Mapping[str, Any]]) -> float | None:

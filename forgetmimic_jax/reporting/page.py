@@ -14,7 +14,6 @@ from forgetmimic_jax.evaluation import plots, tables
 from forgetmimic_jax.evaluation.verdict import Verdict
 from forgetmimic_jax.reporting.facts import listed
 from forgetmimic_jax.reporting.subject import Subject
-from forgetmimic_jax.unlearning.registry import method_of
 
 
 def page(subject: Subject, verdict: Verdict, facts: Mapping[str, Any], films: tuple[list[dict[str, str]], str]) -> str:
@@ -46,7 +45,7 @@ def _figures(subject: Subject) -> dict[str, str]:
     rows, config = subject.rows, subject.info.config
     figures = {"bars": _svg(plots.clip_bars, subject.document), "curves": "", "sampling": ""}
     if rows:
-        penalty = config.unlearn.penalty if method_of(config).penalised else None
+        penalty = config.unlearn.settings.get("penalty")
         figures |= {
             "curves": _svg(plots.unlearning_curves, rows, penalty=penalty),
             "sampling": _svg(plots.sampling_shares, rows, targets=subject.document.targets),

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -176,11 +177,11 @@ class PPOConfig:
 
 @dataclass(frozen=True)
 class UnlearnConfig:
-    """The unlearning flag: clips to forget, how, and the penalty λ. No targets: ordinary training."""
+    """The unlearning flag: clips to forget, and how. No targets: ordinary training."""
 
     targets: tuple[str, ...] = ()
-    penalty: Positive = 16.0  # λ of arft; W = 8 is the edge of the paper's algebra
     method: str = "arft"  # a module of forgetmimic_jax.unlearning
+    settings: dict[str, float] = field(default_factory=dict)  # the method's own, such as the penalty λ of arft
 
 
 @dataclass(frozen=True)
@@ -259,6 +260,9 @@ def validate(config: Config) -> None:
             f"sampling.target_share: found {config.sampling.target_share:g} with {found}; accepted: 0, or a share "
             "where episodes start from targets too"
         )
+    for name, value in config.unlearn.settings.items():
+        if not 0.0 < value < math.inf:
+            raise InputError(f"unlearn.settings.{name}: found {value!r}; accepted: a number above 0")
     ppo = config.ppo
     if ppo.num_envs * ppo.num_steps < ppo.minibatches:
         raise InputError(

@@ -15,9 +15,8 @@ from forgetmimic_jax.unlearning.method import Method
 
 def anti_reward(config: Config, reward: Reward, is_target: Array, key: Array) -> Array:
     """R' [env] = R_track + R_reg − λ r̄ on target steps; R_track + R_reg elsewhere."""
-    return (
-        plain_reward(config, reward, is_target, key) - config.unlearn.penalty * reward.normalized_tracking * is_target
-    )
+    penalty = config.unlearn.settings["penalty"]
+    return plain_reward(config, reward, is_target, key) - penalty * reward.normalized_tracking * is_target
 
 
-METHOD = Method(reward=anti_reward, penalised=True)
+METHOD = Method(reward=anti_reward, settings={"penalty": 16.0})  # λ; W = 8 is the edge of the paper's algebra

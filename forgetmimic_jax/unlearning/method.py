@@ -51,12 +51,12 @@ class Method(Rule):
         start: from the base with uniform sampling and no wrench; a fresh policy that the base teaches, the same way; or
             a fresh policy with the base's own settings.
         result: what evaluation.json calls the policy.
-        penalised: whether the penalty λ (`unlearn.penalty`) is a setting of the method.
+        settings: its own settings (`unlearn.settings`) and their defaults.
         pace: how long it trains and with which PPO settings.
     """
 
     clips: Literal["all", "kept"] = "all"
     start: Literal["base", "taught", "fresh"] = "base"
     result: Literal["unlearned", "retrained", "fine_tuned"] = "unlearned"
-    penalised: bool = False
+    settings: Mapping[str, float] = field(default_factory=dict)
     pace: Pace = FINE_TUNING

@@ -39,9 +39,19 @@ def method_of(config: Config) -> Method:
 def unlearning_config(base: Config, unlearn: UnlearnConfig) -> Config:
     """The base's run as an unlearning run: the method on, its clips, the sampler uniform, the wrench off; no more.
 
+    The method's settings that are left out have their defaults.
     A method that trains a fresh policy on its own keeps the base's sampler and wrench: it is trained as the base was.
+
+    Raises:
+        InputError: an unknown method, or a setting that the method does not have.
     """
     method = find_method(unlearn.method)
+    for name in unlearn.settings:
+        if name not in method.settings:
+            raise InputError(
+                f"unlearn.settings: {unlearn.method} has no setting '{name}'; {nearest(name, method.settings)}"
+            )
+    unlearn = dataclasses.replace(unlearn, settings={**method.settings, **unlearn.settings})
     sampling = dataclasses.replace(base.sampling, clips=method.clips, target_share=0.0)  # which a base may have had
     wrench = base.wrench
     if method.start != "fresh":

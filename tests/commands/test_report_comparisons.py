@@ -229,7 +229,7 @@ def test_an_incompetent_control_is_not_measured(make_control, study, reported):
     [
         ("robot", "h2"),
         ("unlearn.method", "decremental"),
-        ("unlearn.penalty", 8.0),
+        ("unlearn.settings.penalty", 8.0),
         ("unlearn.targets", ["nod"]),
         ("iterations", 200),
         ("preset", "paper"),

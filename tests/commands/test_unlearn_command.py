@@ -50,7 +50,10 @@ def test_the_sampler_is_uniform_and_the_wrench_off(base_run, unlearned_run):
 def test_its_settings_are_the_base_s_but_for_what_unlearning_changes(base_run, unlearned_run):
     base = load_config(base_run.folder / "config.yaml")
     found = load_config(unlearned_run.folder / "config.yaml")
-    assert (found.unlearn.targets, found.unlearn.penalty) == (("turn",), 16.0)  # it was asked for " turn, turn ,"
+    assert (found.unlearn.targets, found.unlearn.settings) == (
+        ("turn",),
+        {"penalty": 16.0},
+    )  # it was asked for " turn, turn ,"
     assert found == dataclasses.replace(
         base,
         base=str(base_run.checkpoint(4)),
@@ -125,7 +128,7 @@ def test_it_ends_with_the_table_the_files_and_what_to_do_next(unlearned_run):
     assert (unlearned_run.folder / "evaluation.png").read_bytes().startswith(b"\x89PNG")
     assert (unlearned_run.folder / "evaluation.md").read_text().startswith("# Evaluation: g1, targets: turn\n")
     printed = unlearned_run.printed.splitlines()
-    assert printed[0] == "forget turn: 0/2"
+    assert printed[0] == "forget turn by arft: 0/2"
     assert "Clip by clip" in [line.strip() for line in printed]
     path = unlearned_run.checkpoint(2)
     assert printed[-1] == f"Next: make evaluate ROBOT=g1 CHECKPOINT={path} EPISODES=100"
@@ -185,10 +188,10 @@ def test_a_preset_brings_its_settings_but_keeps_the_base_s_network(options, base
             {"set": [["unlearn.targets=[]"]]},
             "--targets: no clip named; name at least one to forget, such as --targets punch,kick",
         ),
-        ({"penalty": 0.0}, "unlearn.penalty: found 0.0; accepted: a number above 0"),
-        ({"penalty": -16.0}, "unlearn.penalty: found -16.0; accepted: a number above 0"),
-        ({"penalty": float("nan")}, "unlearn.penalty: found nan; accepted: a number above 0"),
-        ({"penalty": float("inf")}, "unlearn.penalty: found inf; accepted: a number above 0"),
+        ({"penalty": 0.0}, "unlearn.settings.penalty: found 0.0; accepted: a number above 0"),
+        ({"penalty": -16.0}, "unlearn.settings.penalty: found -16.0; accepted: a number above 0"),
+        ({"penalty": float("nan")}, "unlearn.settings.penalty: found nan; accepted: a number above 0"),
+        ({"penalty": float("inf")}, "unlearn.settings.penalty: found inf; accepted: a number above 0"),
         ({"episodes": 0}, "--episodes: found 0; accepted: 1 or more"),
         ({"iterations": 0}, "iterations: found 0; accepted: a whole number from 1"),
         ({"iterations": -1}, "iterations: found -1; accepted: a whole number from 1"),

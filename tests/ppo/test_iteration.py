@@ -92,7 +92,7 @@ def run(robot, library, tiny_config) -> Run:
             gae_lambda=GAE_LAMBDA,
         ),
     )
-    unlearn = dataclasses.replace(plain.unlearn, targets=("turn",), penalty=PENALTY, method="arft")
+    unlearn = dataclasses.replace(plain.unlearn, targets=("turn",), method="arft", settings={"penalty": PENALTY})
     setup = Setup(unlearning_config(plain, unlearn), robot, library, "invented")
     return Run(make_environment(setup, ENVS), make_assets(setup))
 

@@ -12,7 +12,9 @@ from forgetmimic_jax.unlearning.arft import METHOD
 
 
 def forgetting(penalty: float, method: str = "arft") -> Config:
-    return dataclasses.replace(Config(), unlearn=UnlearnConfig(("punch",), penalty, method))
+    return dataclasses.replace(
+        Config(), unlearn=UnlearnConfig(("punch",), method, {"penalty": penalty} if method == "arft" else {})
+    )
 
 
 def metrics_of(config: Config) -> dict[str, float]:

@@ -39,7 +39,7 @@ def test_the_paper_preset_has_the_papers_numbers():
     assert ppo.critic_layers == (1024, 1024, 512, 256)
     assert (config.sampling.bin_seconds, config.sampling.smoothing, config.sampling.uniform_ratio) == (4.0, 0.005, 0.15)
     assert (config.wrench.sensitivity, config.wrench.max_gain) == (0.8, 0.6)
-    assert config.unlearn == UnlearnConfig(targets=(), penalty=16.0)
+    assert config.unlearn == UnlearnConfig(targets=(), method="arft", settings={})
 
 
 @pytest.mark.parametrize("name", ["paper", "cpu"])
@@ -56,7 +56,7 @@ def test_an_unknown_preset_is_told():
 @pytest.mark.parametrize("name", ["paper", "cpu"])
 def test_a_saved_config_is_read_back_equal(path, name):
     config = dataclasses.replace(
-        preset(name), library="clips", unlearn=UnlearnConfig(targets=("punch", "kick"), penalty=8.5)
+        preset(name), library="clips", unlearn=UnlearnConfig(targets=("punch", "kick"), settings={"penalty": 8.5})
     )
     save_config(config, path)
     assert load_config(path) == config

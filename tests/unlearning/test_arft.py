@@ -13,7 +13,7 @@ ON_TARGET = jnp.array([True, False])
 
 
 def forgetting(penalty: float) -> Config:
-    return dataclasses.replace(Config(), unlearn=UnlearnConfig(targets=("punch",), penalty=penalty))
+    return dataclasses.replace(Config(), unlearn=UnlearnConfig(("punch",), settings={"penalty": penalty}))
 
 
 def training_reward(config: Config, reward: Reward, is_target) -> jax.Array:

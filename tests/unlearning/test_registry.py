@@ -39,7 +39,7 @@ def test_a_method_says_where_it_differs_from_ppo():
         return {f.name for f in dataclasses.fields(Method) if getattr(method, f.name) != getattr(Method(), f.name)}
 
     assert {name: changes(name) for name in NAMES} == {
-        "arft": {"reward"},
+        "arft": {"reward", "settings"},
         "retrain": {"clips", "start", "result", "pace"},
         "distill": {"clips", "start", "pace"},
         "finetune": {"clips", "result"},
@@ -56,7 +56,10 @@ def test_a_method_says_where_it_differs_from_ppo():
 @pytest.mark.parametrize("base", [preset("paper"), preset("cpu")])
 def test_unlearning_changes_exactly_three_things(base):
     base = dataclasses.replace(base, wrench=dataclasses.replace(base.wrench, max_gain=0.6), seed=3)
-    before, after = to_dict(base), to_dict(unlearning_config(base, UnlearnConfig(("punch", "kick"), 12.0)))
+    before, after = (
+        to_dict(base),
+        to_dict(unlearning_config(base, UnlearnConfig(("punch", "kick"), settings={"penalty": 12.0}))),
+    )
     changed = {
         (section, name): value
         for section, content in after.items()
@@ -66,7 +69,7 @@ def test_unlearning_changes_exactly_three_things(base):
     }
     assert changed == {
         ("unlearn", "targets"): ["punch", "kick"],
-        ("unlearn", "penalty"): 12.0,
+        ("unlearn", "settings"): {"penalty": 12.0},
         ("sampling", "rule"): "uniform_clips",
         ("wrench", "max_gain"): 0.0,
     }
@@ -79,3 +82,10 @@ def test_retraining_is_the_base_s_own_training_without_the_targets():
     assert found == dataclasses.replace(
         base, unlearn=found.unlearn, sampling=dataclasses.replace(base.sampling, clips="kept")
     )
+
+
+def test_a_method_carries_its_own_settings():
+    found = unlearning_config(Config(), UnlearnConfig(("punch",)))
+    assert found.unlearn.settings == {"penalty": 16.0}
+    with pytest.raises(InputError, match=r"unlearn\.settings: the method retrain has no 'penalty'; known: none"):
+        unlearning_config(Config(), UnlearnConfig(("punch",), "retrain", {"penalty": 4.0}))
