@@ -87,5 +87,5 @@ def test_retraining_is_the_base_s_own_training_without_the_targets():
 def test_a_method_carries_its_own_settings():
     found = unlearning_config(Config(), UnlearnConfig(("punch",)))
     assert found.unlearn.settings == {"penalty": 16.0}
-    with pytest.raises(InputError, match=r"unlearn\.settings: the method retrain has no 'penalty'; known: none"):
+    with pytest.raises(InputError, match=r"unlearn\.settings: retrain has no setting .penalty.; known: none"):
         unlearning_config(Config(), UnlearnConfig(("punch",), "retrain", {"penalty": 4.0}))
