@@ -88,8 +88,8 @@ def fill(text: str, directory: Path) -> str:
         if not path.is_file():
             raise InputError(f"evaluation block: no file {block['path']}")
         document = read_evaluation(path)
-        source = f"From `{block['path']}`: {_budget(document)}"
-        return f"{block[1]}{source}\n\n{markdown_tables(document)}{block[3]}"
+        source = f"From `{block['path']}`: {_budget(document)}{_code(document)}"
+        return f"{block[1]}{source}\n\n{_summary(document)}\n{block[3]}"
 
     return BLOCK.sub(tables, text)
 
@@ -162,6 +162,18 @@ def _group_rows(document: EvaluationDocument, *, digits: int = 3) -> Rows:
         if any(cells):
             rows.append([label, *cells])
     return Rows("Targets and kept clips", ["", *map(_words, order)], rows)
+
+
+def _summary(document: EvaluationDocument) -> str:
+    """Success, tracking and skill of targets and kept clips, as a short Markdown table."""
+    table = _group_rows(document)
+    shown = ("success", "tracking", "skill")
+    rows = [row for row in table.rows if row[0].partition(" ")[2] in shown]
+    return markdown_table(table.header, rows)
+
+
+def _code(document: EvaluationDocument) -> str:
+    return f" Code: commit {document.made.commit[:7]}." if document.made else ""
 
 
 def _error_rows(document: EvaluationDocument) -> Rows:
