@@ -134,6 +134,13 @@ def generalized_velocity(qpos: np.ndarray, fps: float) -> np.ndarray:
     return np.concatenate([rate(qpos[:, :3], fps), local, rate(qpos[:, 7:], fps)], axis=-1)
 
 
+def tangent_steps(qpos: np.ndarray) -> np.ndarray:
+    """Steps [frame - 1, nv] from each frame's qpos to the next: m and rad, ordered as MuJoCo's qvel."""
+    turns = rotation(qpos[:, 3:7])
+    angular = (turns[:-1].inv() * turns[1:]).as_rotvec()
+    return np.concatenate([np.diff(qpos[:, :3], axis=0), angular, np.diff(qpos[:, 7:], axis=0)], axis=-1)
+
+
 def body_motion(model: mujoco.MjModel, qpos: np.ndarray, fps: float, body_ids: np.ndarray) -> Bodies:
     """Forward kinematics of a clip.
 

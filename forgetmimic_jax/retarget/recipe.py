@@ -14,12 +14,13 @@ import numpy as np
 from forgetmimic_jax.basics.errors import InputError, nearest
 from forgetmimic_jax.motion import library
 from forgetmimic_jax.motion.clip import Clip, write_clip
-from forgetmimic_jax.motion.contact import floor_points, human_contact
-from forgetmimic_jax.motion.deepmimic import forward_kinematics, read_deepmimic
 from forgetmimic_jax.motion.kinematics import PlanarTransform, heading, quaternion, rotation, tile
+from forgetmimic_jax.retarget.contact import human_contact
 from forgetmimic_jax.retarget.cycle import resampled
+from forgetmimic_jax.retarget.deepmimic import forward_kinematics, read_deepmimic
 from forgetmimic_jax.retarget.refine import Weights, refine
 from forgetmimic_jax.retarget.retarget import Targets, inverse_kinematics, leg_scale, make_targets
+from forgetmimic_jax.retarget.timeline import Timeline
 from forgetmimic_jax.robot.model import Robot
 
 FPS = 50.0
@@ -85,10 +86,8 @@ def retarget_clip(robot: Robot, path: Path, name: str, settings: Settings) -> Re
         robot,
         targets,
         human_contact(human, FPS * time_scale),  # speeds of the human's own time
-        floor_points(robot),
         inverse_kinematics(robot, targets),
-        FPS,
-        step,
+        Timeline(targets.num_frames, step, FPS),
     )
     cycle = Clip(name, FPS, robot.joint_names, qpos[:, :3], quaternion(rotation(qpos[:, 3:7])), qpos[:, 7:])
     clip = cycle if step is None else tile(cycle, step, settings.seconds)

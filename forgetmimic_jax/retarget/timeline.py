@@ -16,6 +16,7 @@ class Timeline:
 
     frames: int
     step: PlanarTransform | None
+    fps: float
 
     @property
     def cyclic(self) -> bool:
