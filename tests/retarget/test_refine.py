@@ -9,13 +9,14 @@ from scipy.spatial.transform import Rotation
 
 from forgetmimic_jax.motion.contact import floor_points, floor_positions
 from forgetmimic_jax.motion.dynamics import FRICTION, RADIUS, floor_answer
-from forgetmimic_jax.motion.kinematics import PlanarTransform, generalized_velocity, heading
+from forgetmimic_jax.motion.kinematics import generalized_velocity
 from forgetmimic_jax.motion.motors import InverseDynamics, motor_loads
 from forgetmimic_jax.retarget.contact import human_contact
 from forgetmimic_jax.retarget.cycle import resampled
 from forgetmimic_jax.retarget.deepmimic import LEG_LENGTH, forward_kinematics, read_deepmimic
 from forgetmimic_jax.retarget.dynamics import floor_wrench, motor_torque
 from forgetmimic_jax.retarget.least_squares import Term, gauss_newton_step
+from forgetmimic_jax.retarget.planar import PlanarTransform, heading
 from forgetmimic_jax.retarget.pose import pose_of
 from forgetmimic_jax.retarget.refine import Problem, Weights, refine
 from forgetmimic_jax.retarget.retarget import inverse_kinematics, leg_scale, make_targets

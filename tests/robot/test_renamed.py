@@ -14,7 +14,7 @@ from forgetmimic_jax.motion.contact import floor_points
 from forgetmimic_jax.motion.draw import picture
 from forgetmimic_jax.motion.fit import fit, on_floor
 from forgetmimic_jax.motion.mirror import mirrored
-from forgetmimic_jax.motion.readers import read_motion
+from forgetmimic_jax.motion.readers import Reading, read_motion
 from forgetmimic_jax.retarget.contact import human_parts
 from forgetmimic_jax.retarget.retarget import leg_scale
 from forgetmimic_jax.robot.model import ROBOTS_DIR, load_robot
@@ -83,7 +83,7 @@ def test_its_motions_are_imported_the_same(robot, renamed, clips, tmp_path):
     rows = np.concatenate([clips[0].root_pos, np.roll(clips[0].root_quat, -1, axis=-1), clips[0].joint_pos], axis=-1)
     np.savetxt(tmp_path / "kick.csv", rows, delimiter=",")
     for whose in (robot, renamed):
-        found, raised = on_floor(whose, fit(whose, read_motion(whose, tmp_path / "kick.csv", fps=30.0), 50.0))
+        found, raised = on_floor(whose, fit(whose, read_motion(whose, tmp_path / "kick.csv", Reading(fps=30.0)), 50.0))
         library.add_clip(tmp_path / whose.name, whose, found, {"raised": raised})
     ours, its = (library.load_library(whose, tmp_path / whose.name) for whose in (robot, renamed))
     for field in ("joint_pos", "body_pos", "body_quat", "body_ang_vel", "anchor_lin_acc"):
