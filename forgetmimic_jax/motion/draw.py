@@ -18,7 +18,7 @@ PIXELS_PER_M = 88.0  # for a robot of the G1's height
 SMOOTH = 3  # drawn this much larger, then shrunk
 FLOOR_LINE = HEIGHT - 30  # pixel row of the floor below the root
 AZIMUTH, ELEVATION = np.radians(60.0), np.radians(10.0)  # of the viewer, from the robot's starting x axis
-LEFT, RIGHT, TRUNK = (60, 110, 215), (225, 120, 45), (120, 120, 126)
+COLOURS = {"left": (60, 110, 215), "right": (225, 120, 45), "": (120, 120, 126)}
 PAPER, SHADOW = (255, 255, 255), (222, 222, 222)
 
 
@@ -57,8 +57,7 @@ def picture(robot: Robot, qpos: np.ndarray) -> Image.Image:
         half = model.geom_size[geom, 1] if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CAPSULE else 0.0
         axis = data.geom_xmat[geom].reshape(3, 3)[:, 2] * half
         ends = np.stack([data.geom_xpos[geom] - axis, data.geom_xpos[geom] + axis])
-        body = model.body(model.geom_bodyid[geom]).name
-        colour = LEFT if body.startswith("left") else RIGHT if body.startswith("right") else TRUNK
+        colour = COLOURS[robot.body_sides[model.geom_bodyid[geom]]]
         if geom in robot.foot_geom_ids:  # joined to the ankle, so that the foot is seen
             ends = np.stack([data.xpos[model.geom_bodyid[geom]], data.geom_xpos[geom]])
         shapes.append((ends, model.geom_size[geom, 0], colour))

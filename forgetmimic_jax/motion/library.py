@@ -149,6 +149,29 @@ def write_manifest(path: Path, manifest: dict[str, Any]) -> None:
     write_atomically(path / MANIFEST, (json.dumps(manifest, indent=2) + "\n").encode())
 
 
+def manifest_for(path: Path, robot: Robot, name: str, fps: float, *, overwrite: bool = False) -> dict[str, Any]:
+    """The manifest of a folder that is to get a clip; a new one for a folder that is no library yet.
+
+    Raises:
+        InputError: a name that cannot be a file's, another robot's library, another rate, or a name that is taken.
+    """
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", name):
+        raise InputError(f"name: found '{name}'; letters, digits, - and _ are accepted, a letter or digit first")
+    if (path / MANIFEST).exists():
+        manifest = read_manifest(path)
+    else:
+        if path.is_dir() and any(path.iterdir()):
+            raise InputError(f"{path}: has files but no {MANIFEST}; give an empty or a new folder, or a library")
+        manifest = {"schema": SCHEMA, "robot": robot.name, "fps": fps, "default_targets": [], "clips": {}}
+    if manifest["robot"] != robot.name:
+        raise InputError(f"{path / MANIFEST}: robot: found '{manifest['robot']}'; the clip is '{robot.name}'s")
+    if manifest["fps"] != fps:
+        raise InputError(f"{path / MANIFEST}: fps: found {manifest['fps']}; the clip has {fps}")
+    if name in manifest["clips"] and not overwrite:
+        raise InputError(f"{path}: already has a clip '{name}'; give another --name, or --force to replace it")
+    return manifest
+
+
 def add_clip(path: Path, robot: Robot, clip: Clip, facts: Mapping[str, Any], *, overwrite: bool = False) -> Path:
     """Write a clip and its manifest entry; a folder that is no library yet becomes one.
 
@@ -160,23 +183,10 @@ def add_clip(path: Path, robot: Robot, clip: Clip, facts: Mapping[str, Any], *, 
         overwrite: replace a clip of that name.
 
     Raises:
-        InputError: a name that cannot be a file's, another robot's library, another rate, or a name that is taken.
+        InputError: other joints than the robot's, or as `manifest_for`.
     """
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", clip.name):
-        raise InputError(f"name: found '{clip.name}'; letters, digits, - and _ are accepted, a letter or digit first")
     _check_joints(clip, robot)
-    if (path / MANIFEST).exists():
-        manifest = read_manifest(path)
-    else:
-        if path.is_dir() and any(path.iterdir()):
-            raise InputError(f"{path}: has files but no {MANIFEST}; give an empty or a new folder, or a library")
-        manifest = {"schema": SCHEMA, "robot": robot.name, "fps": clip.fps, "default_targets": [], "clips": {}}
-    if manifest["robot"] != robot.name:
-        raise InputError(f"{path / MANIFEST}: robot: found '{manifest['robot']}'; the clip is '{robot.name}'s")
-    if manifest["fps"] != clip.fps:
-        raise InputError(f"{path / MANIFEST}: fps: found {manifest['fps']}; the clip has {clip.fps}")
-    if clip.name in manifest["clips"] and not overwrite:
-        raise InputError(f"{path}: already has a clip '{clip.name}'; give another --name, or --force to replace it")
+    manifest = manifest_for(path, robot, clip.name, clip.fps, overwrite=overwrite)
     path.mkdir(parents=True, exist_ok=True)
     file = path / f"{clip.name}.npz"
     write_clip(clip, file)

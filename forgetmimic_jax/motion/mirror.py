@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import mujoco
 import numpy as np
 
 from forgetmimic_jax.basics.errors import InputError
@@ -19,11 +20,12 @@ def mirrored(robot: Robot, clip: Clip) -> Clip:
     Raises:
         InputError: a joint without a counterpart on the other side, or one that turns about no mirrored axis.
     """
-    axes = {name: robot.model.joint(name).axis for name in clip.joint_names}
+    axes = dict(zip(robot.joint_names, _axes(robot), strict=True))
+    others = {name: robot.joint_names[place] for name, place in zip(robot.joint_names, robot.counterpart, strict=True)}
     joint_pos = np.empty_like(clip.joint_pos)
     for place, name in enumerate(clip.joint_names):
-        other = _other_side(name)
-        if other not in axes:
+        other = others[name]
+        if other not in clip.joint_names:
             raise InputError(f"robot {robot.name}: joint '{name}' has no counterpart '{other}'; it has no mirror image")
         sign = float(np.dot(PSEUDOVECTOR * axes[other], axes[name]))
         if abs(abs(sign) - 1.0) > 1e-3:
@@ -38,7 +40,10 @@ def mirrored(robot: Robot, clip: Clip) -> Clip:
     )
 
 
-def _other_side(name: str) -> str:
-    if name.startswith("left_"):
-        return "right_" + name.removeprefix("left_")
-    return "left_" + name.removeprefix("right_") if name.startswith("right_") else name
+def _axes(robot: Robot) -> np.ndarray:
+    """Axes [joint, 3] of the joints in the root's frame, every joint at 0."""
+    data = mujoco.MjData(robot.model)
+    data.qpos[:] = 0.0
+    data.qpos[3] = 1.0
+    mujoco.mj_kinematics(robot.model, data)
+    return data.xaxis[1:].copy()

@@ -15,12 +15,10 @@ from scipy.optimize import nnls
 
 from forgetmimic_jax.motion.contact import FloorPoints
 from forgetmimic_jax.motion.dynamics import PYRAMID, RADIUS, TOUCHING
-from forgetmimic_jax.motion.least_squares import Term
-from forgetmimic_jax.motion.timeline import Timeline
+from forgetmimic_jax.motion.kinematics import tangent_steps
 from forgetmimic_jax.robot.model import Robot
 
 BALANCE = 20.0  # motors' torque limits that a missing root force of the robot's weight counts as
-SURE = 1.0  # torque limits: beyond it a lack counts linearly, so that an impact does not bend the motion
 STEP = 1e-6  # of the finite differences
 
 
@@ -31,56 +29,8 @@ class Load(NamedTuple):
     project: np.ndarray  # [joint, nv] its change by a generalized force, N and N m
 
 
-def motor_torque(
-    robot: Robot,
-    timeline: Timeline,
-    qpos: np.ndarray,
-    points: np.ndarray,
-    points_jac: np.ndarray,
-    flight: np.ndarray,
-    fps: float,
-    share: float,
-    weight: float,
-) -> Term:
-    """What each motor lacks, in torque limits, times `weight`: [row, joint], 0 where it has enough.
-
-    Args:
-        robot: the robot.
-        timeline: of the clip's frames.
-        qpos: [frame, nq].
-        points: [frame, point, 3] m that can touch the floor.
-        points_jac: [frame, point, 3, nv].
-        flight: bool[frame], no contact is allowed.
-        fps: frames per s.
-        share: of the torque limits that the motion may use.
-        weight: per torque limit.
-    """
-    change, before, after = timeline.changes(qpos)
-    first, _ = timeline.having(2)
-    second = (first + 1) % timeline.frames
-    velocity, acceleration = _rates(change[first], change[second], fps)
-    inverse, counted = InverseDynamics(robot), ~wrists(robot)
-    lack = np.zeros((len(first), robot.num_joints))
-    position, speed, rate = (np.zeros((*lack.shape, robot.model.nv)) for _ in range(3))
-    for row, frame in enumerate(second):
-        force = inverse.force(qpos[frame], velocity[row], acceleration[row])
-        touching = (points[frame, :, 2] < TOUCHING) & ~flight[frame]
-        load = answered(robot, force, points_jac[frame, touching])
-        lack[row] = counted * (load.torque - np.clip(load.torque, -share, share))
-        if lack[row].any():
-            project = (lack[row] != 0.0)[:, None] * load.project
-            position[row], speed[row], rate[row] = (project @ by for by in inverse.derivatives())
-    speed, rate = 0.5 * fps * speed, fps**2 * rate
-    blocks = {
-        0: (speed - rate) @ before[first],
-        1: position + speed @ (after[first] + before[second]) + rate @ (before[second] - after[first]),
-        2: (speed + rate) @ after[second],
-    }
-    return Term(first, lack, blocks).softened(weight, SURE)
-
-
 def motor_loads(robot: Robot, points: FloorPoints, positions: np.ndarray, qpos: np.ndarray, fps: float) -> np.ndarray:
-    """Torque over torque limit of every motor, 0 for the wrists': [frame - 2, joint], signed.
+    """Torque over torque limit of every motor, 0 where it does not count: [frame - 2, joint], signed.
 
     Args:
         robot: the robot.
@@ -89,19 +39,19 @@ def motor_loads(robot: Robot, points: FloorPoints, positions: np.ndarray, qpos: 
         qpos: [frame, nq].
         fps: frames per s.
     """
-    change, _, _ = Timeline(len(qpos), None).changes(qpos)
-    velocity, acceleration = _rates(change[:-1], change[1:], fps)
+    steps = tangent_steps(qpos)
+    velocity, acceleration = rates(steps[:-1], steps[1:], fps)
     inverse, loads = InverseDynamics(robot), np.zeros((len(velocity), robot.num_joints))
     for row in range(len(loads)):
         force = inverse.force(qpos[row + 1], velocity[row], acceleration[row])
         touching = np.flatnonzero(positions[row + 1, :, 2] < TOUCHING)
         loads[row] = answered(robot, force, inverse.jacobians(points, touching)).torque
-    return np.where(wrists(robot), 0.0, loads)
+    return np.where(robot.motor_counts, loads, 0.0)
 
 
-def wrists(robot: Robot) -> np.ndarray:
-    """bool[joint]: motors that do not count. A wrist that gives way moves nothing else; a handstand overloads it."""
-    return np.array(["wrist" in joint for joint in robot.joint_names])
+def rates(step: np.ndarray, next_step: np.ndarray, fps: float) -> tuple[np.ndarray, np.ndarray]:
+    """Velocity and acceleration at the frame between two tangent steps."""
+    return 0.5 * fps * (step + next_step), fps**2 * (next_step - step)
 
 
 def answered(robot: Robot, force: np.ndarray, jacobians: np.ndarray) -> Load:
@@ -112,7 +62,7 @@ def answered(robot: Robot, force: np.ndarray, jacobians: np.ndarray) -> Load:
         force: generalized [nv] that the motion needs, N and N m.
         jacobians: [point, 3, nv] of the points that touch.
     """
-    root = BALANCE / (float(robot.model.body_subtreemass[1]) * 9.81)
+    root = BALANCE / robot.weight
     motors = 1.0 / np.asarray(robot.arrays.effort, np.float64)
     scale = np.concatenate([np.full(3, root), np.full(3, root / RADIUS), motors])
     torque, project = scale * force, np.diag(scale)
@@ -155,8 +105,3 @@ class InverseDynamics:
             point = self._data.xpos[body] + self._data.xmat[body].reshape(3, 3) @ points.local[row]
             mujoco.mj_jac(self._model, self._data, jacobian, None, point, body)
         return found
-
-
-def _rates(change: np.ndarray, next_change: np.ndarray, fps: float) -> tuple[np.ndarray, np.ndarray]:
-    """Velocity and acceleration at the frame between two tangent steps."""
-    return 0.5 * fps * (change + next_change), fps**2 * (next_change - change)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from forgetmimic_jax.motion.clip import Clip
-from forgetmimic_jax.motion.contact import SIDES, FloorPoints, floor_points, floor_positions
+from forgetmimic_jax.motion.contact import FloorPoints, floor_points, floor_positions
 from forgetmimic_jax.motion.dynamics import missing_acceleration
 from forgetmimic_jax.motion.kinematics import configuration, rate
 from forgetmimic_jax.motion.motors import motor_loads
@@ -52,7 +52,7 @@ class Quality:
     seam: float | None  # velocity jump where cycles meet, over the largest change elsewhere; cyclic clips
     flight_acceleration: float | None  # m/s^2, vertical, of the centre of mass, median of flight
     missing_acceleration: float | None  # m/s^2 that no contact gives, the worst mean over MISSING_SECONDS
-    motor_load: float | None  # torque over torque limit, the worst motor's worst mean over LOAD_SECONDS, without wrists
+    motor_load: float | None  # torque over torque limit, the worst mean over LOAD_SECONDS of a motor that counts
 
     def failures(self) -> list[str]:
         """What misses the bar, in words; empty where the clip passes."""
@@ -109,7 +109,7 @@ def measure(robot: Robot, clip: Clip, cycle_frames: int | None = None) -> Qualit
         name=clip.name,
         seconds=clip.seconds,
         sole_lowest=float(height[:, points.is_sole].min()),
-        stance_height=_stance_height(points, positions, clip.fps),
+        stance_height=_stance_height(robot, points, positions, clip.fps),
         skate=_skate(points, positions, clip.fps),
         other_lowest=float(height[:, ~points.is_sole].min()),
         joint_speed=float((np.abs(joint_vel) / robot.joint_velocity_limit).max()),
@@ -143,10 +143,10 @@ def _means(rows: np.ndarray, seconds: float, fps: float) -> np.ndarray | None:
     return sliding_window_view(rows, window, axis=0).mean(axis=-1) if len(rows) >= window else None
 
 
-def _stance_height(points: FloorPoints, positions: np.ndarray, fps: float) -> float | None:
+def _stance_height(robot: Robot, points: FloorPoints, positions: np.ndarray, fps: float) -> float | None:
     heights = []
-    for side in SIDES:
-        foot = positions[:, points.foot(side)]
+    for body in robot.pairs.feet:
+        foot = positions[:, points.is_sole & (points.body == body)]
         speed = np.linalg.norm(rate(foot.mean(axis=1), fps), axis=-1)
         lowest = foot[..., 2].min(axis=1)
         heights.append(lowest[(lowest < STANCE_HEIGHT) & (speed < STANCE_SPEED)])

@@ -6,10 +6,12 @@ accepted.
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import pickle
 import zipfile
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,45 +29,39 @@ MISPLACED = 0.12  # m that the robot's lowest point lies from the floor on avera
 JOINT_SLACK = 1.0  # rad beyond a joint's range: other robots, degrees and shuffled joints are further off
 
 
-def read_motion(
-    robot: Robot,
-    path: Path,
-    *,
-    name: str | None = None,
-    fps: float | None = None,
-    quaternion_order: str = "auto",
-    assume_robot_order: bool = False,
-) -> Clip:
-    """Read a motion file by its suffix: .csv, .npz or .pkl.
+@dataclass(frozen=True)
+class Reading:
+    """How a motion file is to be read, where it does not say."""
 
-    Args:
-        robot: whose joints the file holds.
-        path: the file.
-        name: of the clip; the file's stem by default.
-        fps: frames per s of a CSV, which does not say; of another file, instead of its own.
-        quaternion_order: 'xyzw', 'wxyz', or 'auto': the format's own (CSV and pickle xyzw, NPZ wxyz).
-        assume_robot_order: accept an NPZ without joint names as being in the robot's order.
-    """
-    readers: dict[str, Callable[[], Clip]] = {
-        ".csv": lambda: read_csv(robot, path, fps, quaternion_order),
-        ".npz": lambda: read_npz(robot, path, fps, quaternion_order, assume_robot_order),
-        ".pkl": lambda: read_gmr(robot, path, fps, quaternion_order),
-    }
+    name: str | None = None  # of the clip; the file's stem by default
+    fps: float | None = None  # frames per s of a CSV, which does not say; of another file, instead of its own
+    quaternion_order: str = "auto"  # of the root: 'xyzw', 'wxyz', or the format's own (CSV and pickle xyzw, NPZ wxyz)
+    assume_robot_order: bool = False  # an NPZ without joint names is in the robot's order
+
+    def order(self, own: str) -> str:
+        """The order of the quaternion in a format whose own order this is."""
+        return own if self.quaternion_order == "auto" else self.quaternion_order
+
+
+def read_motion(robot: Robot, path: Path, reading: Reading | None = None) -> Clip:
+    """Read a motion file of the robot by its suffix: .csv, .npz or .pkl."""
+    reading = reading or Reading()
+    readers: dict[str, Callable[[Robot, Path, Reading], Clip]] = {".csv": read_csv, ".npz": read_npz, ".pkl": read_gmr}
     if path.suffix.lower() not in readers:
         raise InputError(f"{path}: suffix: found '{path.suffix}'; accepted: {', '.join(readers)}")
     if not path.is_file():
         raise InputError(f"{path}: not found")
-    clip = validated(readers[path.suffix.lower()](), str(path))
+    clip = validated(readers[path.suffix.lower()](robot, path, reading), str(path))
     _check_plausible(robot, clip, path)
-    return Clip(name or path.stem, clip.fps, clip.joint_names, clip.root_pos, clip.root_quat, clip.joint_pos)
+    return dataclasses.replace(clip, name=reading.name or path.stem)
 
 
-def read_csv(robot: Robot, path: Path, fps: float | None, quaternion_order: str = "auto") -> Clip:
+def read_csv(robot: Robot, path: Path, reading: Reading) -> Clip:
     """LAFAN1-style CSV: a row a frame of root x, y, z in m, a quaternion (xyzw) and the joints in rad, robot order.
 
     A first line of words is taken for a header.
     """
-    if fps is None:
+    if reading.fps is None:
         raise InputError(f"{path}: fps: a CSV does not say its rate; give it with --fps (LAFAN1 retargets: 30)")
     columns = 7 + robot.num_joints
     rows = []
@@ -86,17 +82,11 @@ def read_csv(robot: Robot, path: Path, fps: float | None, quaternion_order: str 
             )
         rows.append(row)
     values = np.array(rows, np.float64).reshape(-1, columns)
-    quat = _wxyz(values[:, 3:7], _order(quaternion_order, "xyzw"), path, "columns 4-7")
-    return Clip(path.stem, float(fps), robot.joint_names, values[:, :3], quat, values[:, 7:])
+    quat = _wxyz(values[:, 3:7], reading.order("xyzw"), path, "columns 4-7")
+    return Clip(path.stem, float(reading.fps), robot.joint_names, values[:, :3], quat, values[:, 7:])
 
 
-def read_npz(
-    robot: Robot,
-    path: Path,
-    fps: float | None = None,
-    quaternion_order: str = "auto",
-    assume_robot_order: bool = False,
-) -> Clip:
+def read_npz(robot: Robot, path: Path, reading: Reading) -> Clip:
     """mjlab / BeyondMimic NPZ: fps, joint_pos, body_pos_w, body_quat_w (wxyz), and joint_names and body_names.
 
     Without body_names the first body is taken for the root; both only with `assume_robot_order`, and then the file's
@@ -107,12 +97,12 @@ def read_npz(
             content = {field: archive[field] for field in archive.files}
     except (ValueError, zipfile.BadZipFile, EOFError) as error:
         raise InputError(f"{path}: not a readable NPZ ({error})") from None
-    needed = ["joint_pos", "body_pos_w", "body_quat_w"] + (["fps"] if fps is None else [])
+    needed = ["joint_pos", "body_pos_w", "body_quat_w"] + (["fps"] if reading.fps is None else [])
     missing = [field for field in needed if field not in content]
     if missing:
         raise InputError(f"{path}: missing {', '.join(missing)}; found {', '.join(content) or 'nothing'}")
     names = [field for field in ("joint_names", "body_names") if field not in content]
-    if names and not assume_robot_order:
+    if names and not reading.assume_robot_order:
         raise InputError(
             f"{path}: missing {' and '.join(names)}, so the order is unknown; "
             f"give --assume-robot-order if it is {robot.name}'s own (root first)"
@@ -133,15 +123,15 @@ def read_npz(
     if root_name not in bodies:
         raise InputError(f"{path}: body_names: no '{root_name}'; found {', '.join(bodies[:4])} …")
     root = bodies.index(root_name)
-    rate = _rate(content["fps"] if fps is None else fps, path)
-    quat = _wxyz(body_quat[:, root], _order(quaternion_order, "wxyz"), path, "body_quat_w")
+    rate = _rate(content["fps"] if reading.fps is None else reading.fps, path)
+    quat = _wxyz(body_quat[:, root], reading.order("wxyz"), path, "body_quat_w")
     clip = _ordered(robot, Clip(path.stem, rate, joints, body_pos[:, root], quat, joint_pos), path)
     if names and body_pos.shape[1] == robot.model.nbody - 1:
         _check_bodies(robot, validated(clip, str(path)), body_pos, path)
     return clip
 
 
-def read_gmr(robot: Robot, path: Path, fps: float | None = None, quaternion_order: str = "auto") -> Clip:
+def read_gmr(robot: Robot, path: Path, reading: Reading) -> Clip:
     """GMR's pickle: fps, root_pos, root_rot (xyzw), dof_pos in the robot's order. Only numbers are unpickled."""
     try:
         content = NumbersOnly(io.BytesIO(path.read_bytes())).load()
@@ -153,7 +143,7 @@ def read_gmr(robot: Robot, path: Path, fps: float | None = None, quaternion_orde
         raise InputError(f"{path}: not a readable pickle ({type(error).__name__}: {error})") from None
     if not isinstance(content, dict):
         raise InputError(f"{path}: found a {type(content).__name__}; a dict with root_pos, root_rot, dof_pos is needed")
-    needed = ["root_pos", "root_rot", "dof_pos"] + (["fps"] if fps is None else [])
+    needed = ["root_pos", "root_rot", "dof_pos"] + (["fps"] if reading.fps is None else [])
     missing = [field for field in needed if field not in content]
     if missing:
         found = ", ".join(str(field) for field in content) or "nothing"
@@ -162,8 +152,8 @@ def read_gmr(robot: Robot, path: Path, fps: float | None = None, quaternion_orde
     joints = arrays["dof_pos"].shape[-1] if arrays["dof_pos"].ndim else 0
     if joints != robot.num_joints:
         raise InputError(f"{path}: dof_pos: found {joints} joints; {robot.num_joints} of {robot.name} are needed")
-    rate = _rate(content["fps"] if fps is None else fps, path)
-    quat = _wxyz(arrays["root_rot"], _order(quaternion_order, "xyzw"), path, "root_rot")
+    rate = _rate(content["fps"] if reading.fps is None else reading.fps, path)
+    quat = _wxyz(arrays["root_rot"], reading.order("xyzw"), path, "root_rot")
     return Clip(path.stem, rate, robot.joint_names, arrays["root_pos"], quat, arrays["dof_pos"])
 
 
@@ -206,10 +196,6 @@ def _rate(value: Any, path: Path) -> float:
     if len(rates) != 1:
         raise InputError(f"{path}: fps: found {len(rates)} numbers; one is needed")
     return float(rates[0])
-
-
-def _order(given: str, own: str) -> str:
-    return own if given == "auto" else given
 
 
 def _wxyz(quat: np.ndarray, order: str, path: Path, field: str) -> np.ndarray:

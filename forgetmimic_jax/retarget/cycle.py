@@ -8,8 +8,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from forgetmimic_jax.motion.deepmimic import HumanMotion
-from forgetmimic_jax.motion.kinematics import PlanarTransform, heading, turn, wrap_angle
+from forgetmimic_jax.retarget.deepmimic import HumanMotion
+from forgetmimic_jax.retarget.planar import PlanarTransform, heading, turn, wrap_angle
 
 # A recorded gait that should go straight ends a few degrees off; a deliberate turn is larger than this.
 STRAIGHT_YAW = np.radians(30.0)

@@ -14,12 +14,14 @@ import numpy as np
 from forgetmimic_jax.basics.errors import InputError, nearest
 from forgetmimic_jax.motion import library
 from forgetmimic_jax.motion.clip import Clip, write_clip
-from forgetmimic_jax.motion.contact import floor_points, human_contact
-from forgetmimic_jax.motion.deepmimic import forward_kinematics, read_deepmimic
-from forgetmimic_jax.motion.kinematics import PlanarTransform, heading, quaternion, rotation, tile
+from forgetmimic_jax.motion.kinematics import quaternion, rotation
+from forgetmimic_jax.retarget.contact import human_contact
 from forgetmimic_jax.retarget.cycle import resampled
+from forgetmimic_jax.retarget.deepmimic import forward_kinematics, read_deepmimic
+from forgetmimic_jax.retarget.planar import PlanarTransform, heading, tile
 from forgetmimic_jax.retarget.refine import Weights, refine
 from forgetmimic_jax.retarget.retarget import Targets, inverse_kinematics, leg_scale, make_targets
+from forgetmimic_jax.retarget.timeline import Timeline
 from forgetmimic_jax.robot.model import Robot
 
 FPS = 50.0
@@ -85,10 +87,8 @@ def retarget_clip(robot: Robot, path: Path, name: str, settings: Settings) -> Re
         robot,
         targets,
         human_contact(human, FPS * time_scale),  # speeds of the human's own time
-        floor_points(robot),
         inverse_kinematics(robot, targets),
-        FPS,
-        step,
+        Timeline(targets.num_frames, step, FPS),
     )
     cycle = Clip(name, FPS, robot.joint_names, qpos[:, :3], quaternion(rotation(qpos[:, 3:7])), qpos[:, 7:])
     clip = cycle if step is None else tile(cycle, step, settings.seconds)
@@ -121,6 +121,22 @@ def _at_origin(clip: Clip) -> Clip:
     move = PlanarTransform(yaw, np.zeros(2))
     move = PlanarTransform(yaw, -move.apply(clip.root_pos[0])[:2])
     return dataclasses.replace(clip, root_pos=move.apply(clip.root_pos), root_quat=quaternion(move.turn(turns)))
+
+
+def check_output(folder: Path, *, overwrite: bool) -> None:
+    """Raise an InputError where the folder of the library to make holds something that is to be kept."""
+    if not folder.is_dir() or not any(folder.iterdir()):
+        return
+    if not (folder / library.MANIFEST).exists():
+        raise InputError(f"{folder}: has files but no {library.MANIFEST}; give an empty or a new folder")
+    if not overwrite:
+        raise InputError(f"{folder}: already holds a library; give another --output, or --force")
+
+
+def shipped_clips(robot: str) -> tuple[str, ...]:
+    """The clips that are shipped for a robot; every clip of the recipe for another one."""
+    folder = library.DATA_DIR / robot
+    return tuple(library.read_manifest(folder)["clips"] if folder.is_dir() else CLIPS)
 
 
 def retarget_library(

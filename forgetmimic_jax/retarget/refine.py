@@ -10,23 +10,24 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
 
-import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from forgetmimic_jax.motion.contact import FloorPoints, HumanContact
-from forgetmimic_jax.motion.dynamics import floor_wrench
-from forgetmimic_jax.motion.kinematics import PlanarTransform, rotation
-from forgetmimic_jax.motion.least_squares import Term, gauss_newton
-from forgetmimic_jax.motion.motors import motor_torque, wrists
-from forgetmimic_jax.motion.timeline import Timeline, cross_matrix
+from forgetmimic_jax.motion.contact import FloorPoints, floor_points
+from forgetmimic_jax.motion.kinematics import rotation
+from forgetmimic_jax.retarget.contact import HumanContact, human_parts
+from forgetmimic_jax.retarget.dynamics import floor_wrench, motor_torque
+from forgetmimic_jax.retarget.least_squares import Term, gauss_newton
+from forgetmimic_jax.retarget.pose import Pose, pose_of
 from forgetmimic_jax.retarget.retarget import Targets
+from forgetmimic_jax.retarget.timeline import Timeline, cross_matrix
 from forgetmimic_jax.robot.model import Robot
 
 SEAM_SECONDS = 0.12  # half width of the more smoothed seam
 TORQUE_SHARE = 0.8  # of the motors' limits; the rest is for balance
+SPEED_SHARE = 0.8  # of the motors' speed
+LIMIT_MARGIN = 0.02  # rad kept from every joint's limit
 GENTLE = 0.25  # of the dynamics' weight, in a first round
 
 
@@ -36,7 +37,7 @@ class Weights:
 
     hip_centre: float = 0.5  # per m
     posture: float = 0.03  # per rad from the default pose
-    wrist_posture: float = 0.2  # the same for the wrists, which the human skeleton lacks
+    wrist_posture: float = 0.2  # the same where the motor does not count: wrists, which the human skeleton lacks
     stance_height: float = 40.0  # per m that a sole point which is down is off the floor
     stance_slip: float = 150.0  # per m a planted sole point moves in one frame
     floor: float = 60.0  # per m below the floor, or below the clearance of a sole that swings
@@ -53,30 +54,12 @@ class Weights:
         return dataclasses.replace(self, wrench=share * self.wrench, torque=share * self.torque)
 
 
-class Pose(NamedTuple):
-    """Positions and rotations of a clip with their Jacobians over nv."""
-
-    points: np.ndarray  # [frame, point, 3] m
-    points_jac: np.ndarray  # [frame, point, 3, nv]
-    turns: np.ndarray  # [frame, body, 3, 3]
-    turns_jac: np.ndarray  # [frame, body, 3, nv] world-frame rotation
-    com: np.ndarray  # [frame, 3] m
-    com_jac: np.ndarray  # [frame, 3, nv]
-    momentum: np.ndarray  # [frame, 3, nv] matrix of the angular momentum about the centre of mass
-
-
 def refine(
     robot: Robot,
     targets: Targets,
     contact: HumanContact,
-    floor: FloorPoints,
     qpos: np.ndarray,
-    fps: float,
-    step: PlanarTransform | None,
-    *,
-    weights: Weights | None = None,
-    limit_margin: float = 0.02,
-    speed_share: float = 0.8,
+    timeline: Timeline,
     iterations: int = 150,
 ) -> np.ndarray:
     """Improve qpos [frame, 7 + joint].
@@ -85,24 +68,16 @@ def refine(
         robot: the robot.
         targets: limb directions, orientations and the hips' path.
         contact: when soles are planted and when the body flies.
-        floor: the robot's points that may not go under the floor.
         qpos: where to start, from inverse kinematics.
-        fps: frames per s.
-        step: a cyclic clip's planar step from cycle to cycle, at the robot's scale; None if it does not repeat.
-        weights: of the residuals.
-        limit_margin: rad kept from every joint's limit.
-        speed_share: of the motors' speed that the joints may use.
+        timeline: of the frames; a cyclic clip's step is at the robot's scale.
         iterations: Gauss-Newton steps a round.
     """
-    timeline = Timeline(len(qpos), step)
-    weights = weights or Weights()
-
+    weights = Weights()
     gentle, strict = (
-        _Problem(robot, targets, contact, floor, fps, timeline, given, limit_margin, speed_share)
-        for given in (weights.with_dynamics(GENTLE), weights)
+        Problem.of(robot, targets, contact, timeline, given) for given in (weights.with_dynamics(GENTLE), weights)
     )
 
-    def solved(problem: _Problem, start: np.ndarray) -> tuple[np.ndarray, float]:
+    def solved(problem: Problem, start: np.ndarray) -> tuple[np.ndarray, float]:
         return gauss_newton(problem.terms, problem.moved, start, robot.model.nv, timeline.cyclic, iterations)
 
     # What the floor answers has kinks, in which the search may stick. Which way around them is better depends on the
@@ -112,16 +87,22 @@ def refine(
 
 
 @dataclass(frozen=True)
-class _Problem:
+class Problem:
+    """The residuals of a clip."""
+
     robot: Robot
     targets: Targets
     contact: HumanContact
-    floor: FloorPoints
-    fps: float
     timeline: Timeline
     weights: Weights
-    limit_margin: float
-    speed_share: float
+    floor: FloorPoints
+    parts: tuple[str, ...]  # the human's, that the floor points stand for
+
+    @classmethod
+    def of(cls, robot: Robot, targets: Targets, contact: HumanContact, timeline: Timeline, weights: Weights) -> Problem:
+        """The problem with the robot's floor points."""
+        floor = floor_points(robot)
+        return cls(robot, targets, contact, timeline, weights, floor, human_parts(robot, floor))
 
     @property
     def frames(self) -> int:
@@ -129,7 +110,7 @@ class _Problem:
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.robot.joint_lower + self.limit_margin, self.robot.joint_upper - self.limit_margin
+        return self.robot.joint_lower + LIMIT_MARGIN, self.robot.joint_upper - LIMIT_MARGIN
 
     def moved(self, qpos: np.ndarray, delta: np.ndarray) -> np.ndarray:
         """Each frame [nq] moved along its tangent step [nv]."""
@@ -142,50 +123,16 @@ class _Problem:
 
     def terms(self, qpos: np.ndarray) -> list[Term]:
         """Every residual at qpos."""
-        pose = self.pose(qpos)
+        pose = pose_of(self.robot, self.floor, qpos)
         return [
-            *self.imitation(qpos, pose),
+            *self.imitation(pose),
             *self.contacts(pose),
-            *self.dynamics(qpos, pose),
+            *self.dynamics(pose),
             *self.joint_bounds(qpos),
             *self.smoothness(qpos),
         ]
 
-    def pose(self, qpos: np.ndarray) -> Pose:
-        """Kinematics with Jacobians; points: the bodies' origins (by body id), then the floor points."""
-        model = self.robot.model
-        data = mujoco.MjData(model)
-        bodies = model.nbody
-        count = bodies + len(self.floor.body)
-        pose = Pose(
-            np.empty((self.frames, count, 3)),
-            np.empty((self.frames, count, 3, model.nv)),
-            np.empty((self.frames, bodies, 3, 3)),
-            np.empty((self.frames, bodies, 3, model.nv)),
-            np.empty((self.frames, 3)),
-            np.empty((self.frames, 3, model.nv)),
-            np.empty((self.frames, 3, model.nv)),
-        )
-        for frame in range(self.frames):
-            data.qpos[:] = qpos[frame]
-            mujoco.mj_kinematics(model, data)
-            mujoco.mj_comPos(model, data)
-            pose.points[frame, :bodies] = data.xpos
-            pose.turns[frame] = data.xmat.reshape(-1, 3, 3)
-            turns = pose.turns[frame, self.floor.body]
-            pose.points[frame, bodies:] = data.xpos[self.floor.body] + np.einsum("pij,pj->pi", turns, self.floor.local)
-            for body in range(bodies):
-                mujoco.mj_jacBody(model, data, pose.points_jac[frame, body], pose.turns_jac[frame, body], body)
-            for row, body in enumerate(self.floor.body):
-                point = pose.points[frame, bodies + row]
-                mujoco.mj_jac(model, data, pose.points_jac[frame, bodies + row], None, point, body)
-            pose.com[frame] = data.subtree_com[1]
-            mujoco.mj_jacSubtreeCom(model, data, pose.com_jac[frame], 1)
-            mujoco.mj_angmomMat(model, data, pose.momentum[frame], 1)
-        pose.points[:, bodies:, 2] -= self.floor.radius
-        return pose
-
-    def imitation(self, qpos: np.ndarray, pose: Pose) -> Iterator[Term]:
+    def imitation(self, pose: Pose) -> Iterator[Term]:
         """The human's directions and orientations, the hips' path, a weak pull to the default pose."""
         every = np.arange(self.frames)
         for vector in self.targets.vectors:
@@ -193,11 +140,11 @@ class _Problem:
                 value = pose.turns[:, vector.end, :, 1]
                 jacobian = -cross_matrix(value) @ pose.turns_jac[:, vector.end]
             else:
-                along = pose.points[:, vector.end] - pose.points[:, vector.start]
+                along = pose.bodies[:, vector.end] - pose.bodies[:, vector.start]
                 length = np.linalg.norm(along, axis=-1)[:, None]
                 value = along / length
                 project = (np.eye(3) - value[:, :, None] * value[:, None, :]) / length[:, None]
-                jacobian = project @ (pose.points_jac[:, vector.end] - pose.points_jac[:, vector.start])
+                jacobian = project @ (pose.bodies_jac[:, vector.end] - pose.bodies_jac[:, vector.start])
             yield Term(every, vector.cost * (value - vector.target), {0: vector.cost * jacobian})
         for orientation in self.targets.orientations:
             error = (Rotation.from_matrix(pose.turns[:, orientation.body]) * orientation.target.inv()).as_rotvec()
@@ -205,18 +152,17 @@ class _Problem:
             yield Term(every, orientation.cost * error, {0: orientation.cost * jacobian})
         hips = list(self.targets.hip_bodies)
         weight = self.weights.hip_centre
-        error = pose.points[:, hips].mean(axis=1) - self.targets.hip_centre
-        yield Term(every, weight * error, {0: weight * pose.points_jac[:, hips].mean(axis=1)})
+        error = pose.bodies[:, hips].mean(axis=1) - self.targets.hip_centre
+        yield Term(every, weight * error, {0: weight * pose.bodies_jac[:, hips].mean(axis=1)})
         default = np.asarray(self.robot.arrays.default_joint_pos, np.float64)
-        pull = np.where(wrists(self.robot), self.weights.wrist_posture, self.weights.posture)
+        pull = np.where(self.robot.motor_counts, self.weights.posture, self.weights.wrist_posture)
         rows = np.broadcast_to(pull[:, None] * self._joint_rows(), (self.frames, len(pull), self.robot.model.nv))
-        yield Term(every, pull * (qpos[:, 7:] - default), {0: rows})
+        yield Term(every, pull * (pose.qpos[:, 7:] - default), {0: rows})
 
     def contacts(self, pose: Pose) -> Iterator[Term]:
         """Planted parts stay at the floor and do not slip, nothing goes under it, a swinging sole clears it."""
-        bodies = self.robot.model.nbody
         every = np.arange(self.frames)
-        pos, jac = pose.points[:, bodies:], pose.points_jac[:, bodies:]
+        pos, jac = pose.floor, pose.floor_jac
         height = pos[..., 2]
         down, planted, lifted = (
             self._by_point(parts) for parts in (self.contact.down, self.contact.planted, self.contact.lifted)
@@ -243,32 +189,11 @@ class _Problem:
             },
         )
 
-    def dynamics(self, qpos: np.ndarray, pose: Pose) -> Iterator[Term]:
+    def dynamics(self, pose: Pose) -> Iterator[Term]:
         """What neither the floor nor the motors can give."""
-        points = slice(self.robot.model.nbody, None)
-        yield floor_wrench(
-            self.timeline,
-            qpos,
-            pose.com,
-            pose.com_jac,
-            pose.momentum,
-            pose.points[:, points],
-            self.contact.flight,
-            float(self.robot.model.body_subtreemass[1]),
-            self.fps,
-            self.weights.wrench,
-        )
-        yield motor_torque(
-            self.robot,
-            self.timeline,
-            qpos,
-            pose.points[:, points],
-            pose.points_jac[:, points],
-            self.contact.flight,
-            self.fps,
-            TORQUE_SHARE,
-            self.weights.torque,
-        )
+        given = self.robot, self.timeline, pose, self.contact.flight
+        yield floor_wrench(*given, self.weights.wrench)
+        yield motor_torque(*given, share=TORQUE_SHARE, weight=self.weights.torque)
 
     def joint_bounds(self, qpos: np.ndarray) -> Iterator[Term]:
         """Joints inside their limits and below their motors' speed."""
@@ -280,11 +205,11 @@ class _Problem:
         yield Term(every, active * beyond, {0: active[..., None] * self._joint_rows()})
 
         here, ahead = self.timeline.having(1)
-        speed = (joints[ahead] - joints[here]) * self.fps
-        allowed = self.speed_share * self.robot.joint_velocity_limit
+        speed = (joints[ahead] - joints[here]) * self.timeline.fps
+        allowed = SPEED_SHARE * self.robot.joint_velocity_limit
         excess = speed - np.clip(speed, -allowed, allowed)
         active = self.weights.speed * (excess != 0.0)
-        rows = active[..., None] * self._joint_rows() * self.fps
+        rows = active[..., None] * self._joint_rows() * self.timeline.fps
         yield Term(here, active * excess, {0: -rows, 1: rows})
 
     def smoothness(self, qpos: np.ndarray) -> Iterator[Term]:
@@ -306,17 +231,17 @@ class _Problem:
 
     def _smoothing(self, first: np.ndarray) -> np.ndarray:
         """Weight [row, 1] of the third differences that start at frame `first`, larger about a seam."""
-        weight = np.full((len(first), 1), 1.0 / (2.0 * np.pi * self.weights.smooth_hz / self.fps) ** 3)
+        weight = np.full((len(first), 1), 1.0 / (2.0 * np.pi * self.weights.smooth_hz / self.timeline.fps) ** 3)
         if self.timeline.cyclic:
             middle = (first + 1.5) % self.frames
-            distance = np.minimum(middle, self.frames - middle)[:, None] / self.fps
+            distance = np.minimum(middle, self.frames - middle)[:, None] / self.timeline.fps
             weight *= 1.0 + (self.weights.seam - 1.0) * np.exp(-((distance / SEAM_SECONDS) ** 2))
         return weight
 
     def _by_point(self, parts: dict[str, np.ndarray]) -> np.ndarray:
         """A weight by part [frame] laid out over the floor points [frame, point]."""
         none = np.zeros(self.frames)
-        return np.stack([parts.get(part, none) for part in self.floor.part], axis=1)
+        return np.stack([parts.get(part, none) for part in self.parts], axis=1)
 
     def _joint_rows(self) -> np.ndarray:
         """Jacobian [joint, nv] of the joint angles."""

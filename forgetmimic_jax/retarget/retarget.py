@@ -12,18 +12,19 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from forgetmimic_jax.motion.deepmimic import LEG_LENGTH, HumanPose
 from forgetmimic_jax.motion.kinematics import quaternion
+from forgetmimic_jax.retarget.deepmimic import LEG_LENGTH, HumanPose
+from forgetmimic_jax.retarget.timeline import cross_matrix
 from forgetmimic_jax.robot.model import Robot
+from forgetmimic_jax.robot.sides import SIDES
 
-SIDES = ("left", "right")
-LIMBS = {  # human limb: the robot's bodies at its two ends
-    "thigh": ("hip_roll_link", "knee_link"),
-    "shin": ("knee_link", "foot"),
-    "upper_arm": ("shoulder_roll_link", "elbow_link"),
-    "forearm": ("elbow_link", "wrist_yaw_link"),
+LIMBS = {  # human limb: the robot's pairs at its two ends
+    "thigh": ("hips", "knees"),
+    "shin": ("knees", "feet"),
+    "upper_arm": ("shoulders", "elbows"),
+    "forearm": ("elbows", "hands"),
 }
-HINGES = {"thigh": "knee_link", "upper_arm": "elbow_link"}  # human limb: the body whose y axis is the hinge below it
+HINGES = {"thigh": "knees", "upper_arm": "elbows"}  # human limb: the pair of bodies whose y axis is the hinge below it
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class Vector:
         end = np.zeros((3, model.nv))
         if self.start is None:
             mujoco.mj_jacBody(model, data, None, end, self.end)
-            return -_cross(self.value(data)) @ end
+            return -cross_matrix(self.value(data)) @ end
         start = np.zeros((3, model.nv))
         mujoco.mj_jacBody(model, data, end, None, self.end)
         mujoco.mj_jacBody(model, data, start, None, self.start)
@@ -86,34 +87,29 @@ def leg_scale(robot: Robot) -> float:
     """Robot's leg length, hip to sole, over the human's."""
     data = mujoco.MjData(robot.model)
     mujoco.mj_kinematics(robot.model, data)
-    points = [data.xpos[robot.model.body(name).id] for name in ("left_hip_roll_link", "left_knee_link")]
-    foot = data.xpos[_foot(robot, "left")]
+    hip, knee, foot = (data.xpos[pair[0]] for pair in (robot.pairs.hips, robot.pairs.knees, robot.pairs.feet))
     sole = min(data.geom_xpos[geom][2] - robot.model.geom_size[geom][0] for geom in robot.foot_geom_ids)
-    return (np.linalg.norm(points[1] - points[0]) + np.linalg.norm(foot - points[1]) + foot[2] - sole) / LEG_LENGTH
+    return (np.linalg.norm(knee - hip) + np.linalg.norm(foot - knee) + foot[2] - sole) / LEG_LENGTH
 
 
 def make_targets(robot: Robot, pose: HumanPose) -> Targets:
     """Directions from the human's limbs; the hips' path scaled by the legs' ratio."""
     scale = leg_scale(robot)
-    model = robot.model
     orientations = [
         Orientation("pelvis", int(robot.key_body_ids[robot.root]), pose.frames["pelvis"], 1.0),
         Orientation("torso", robot.anchor_body_id, pose.frames["chest"], 0.5),
     ]
     vectors = []
-    for side in SIDES:
-        orientations.append(Orientation(f"{side}_foot", _foot(robot, side), pose.frames[f"{side}_foot"], 0.3))
+    for row, side in enumerate(SIDES):
+        body = {role: pair[row] for role, pair in vars(robot.pairs).items()}
+        orientations.append(Orientation(f"{side}_foot", body["feet"], pose.frames[f"{side}_foot"], 0.3))
         for limb, (start, end) in LIMBS.items():
             target = pose.frames[f"{side}_{limb}"].apply([0.0, 0.0, -1.0])
-            bodies = [
-                _foot(robot, side) if name == "foot" else model.body(f"{side}_{name}").id for name in (start, end)
-            ]
-            vectors.append(Vector(f"{side}_{limb}", bodies[0], bodies[1], target, 1.0))
-        for limb, body in HINGES.items():
+            vectors.append(Vector(f"{side}_{limb}", body[start], body[end], target, 1.0))
+        for limb, role in HINGES.items():
             axis = pose.frames[f"{side}_{limb}"].apply([0.0, 1.0, 0.0])
-            vectors.append(Vector(f"{side}_{limb}_hinge", None, model.body(f"{side}_{body}").id, axis, 0.15))
-    hips = (model.body("left_hip_roll_link").id, model.body("right_hip_roll_link").id)
-    return Targets(hips, pose.points["pelvis"] * scale, tuple(orientations), tuple(vectors), scale)
+            vectors.append(Vector(f"{side}_{limb}_hinge", None, body[role], axis, 0.15))
+    return Targets(robot.pairs.hips, pose.points["pelvis"] * scale, tuple(orientations), tuple(vectors), scale)
 
 
 class VectorTask(mink.Task):
@@ -167,19 +163,9 @@ def inverse_kinematics(robot: Robot, targets: Targets, limit_margin: float = 0.0
 
 
 def _hip_centre_offset(robot: Robot) -> np.ndarray:
-    """Midpoint of the hip_roll bodies in the base's frame [3] m, default pose."""
+    """Midpoint of the hips in the base's frame [3] m, default pose."""
     data = mujoco.MjData(robot.model)
     data.qpos[:7] = [0, 0, 0, 1, 0, 0, 0]
     data.qpos[7:] = 0.0
     mujoco.mj_kinematics(robot.model, data)
-    return np.mean([data.xpos[robot.model.body(f"{side}_hip_roll_link").id] for side in SIDES], axis=0)
-
-
-def _foot(robot: Robot, side: str) -> int:
-    name = next(robot.key_bodies[foot] for foot in robot.feet if robot.key_bodies[foot].startswith(side))
-    return robot.model.body(name).id
-
-
-def _cross(vector: np.ndarray) -> np.ndarray:
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.mean(data.xpos[list(robot.pairs.hips)], axis=0)

@@ -1,4 +1,4 @@
-"""A robot: its MJCF compiled, and its roles, motors and names from the YAML beside it.
+"""A robot: its MJCF compiled, and its roles (which body, joint and motor is which) from the YAML beside it.
 
 Clips are in `motion`, simulation is in `physics`.
 """

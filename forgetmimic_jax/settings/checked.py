@@ -23,6 +23,7 @@ T = TypeVar("T")
 LARGEST = sys.float_info.max
 Amount = Annotated[float, Meta(ge=0, le=LARGEST, description="a number from 0")]
 Positive = Annotated[float, Meta(gt=0, le=LARGEST, description="a number above 0")]
+BodyWeights = Annotated[float, Meta(ge=0, le=100, description="0 to 100 body weights")]
 Share = Annotated[float, Meta(ge=0, le=1, description="a number from 0 to 1")]
 Weight = Annotated[float, Meta(ge=-LARGEST, le=LARGEST, description="a finite number")]
 NotComputed = Annotated[float, Meta(ge=0, le=0, description="0 (this term is not computed)")]

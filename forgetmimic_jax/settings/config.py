@@ -20,6 +20,7 @@ from forgetmimic_jax.basics.errors import InputError, nearest
 from forgetmimic_jax.basics.files import write_atomically
 from forgetmimic_jax.settings.checked import (
     Amount,
+    BodyWeights,
     Count,
     Interval,
     NotComputed,
@@ -86,7 +87,7 @@ class TerminationConfig:
     orientation: Amount = 0.8  # difference of projected gravity's z, or rad with orientation_rule 'angle'
     orientation_rule: Literal["gravity_z", "angle"] = "gravity_z"
     end_effector_height: Amount = 0.25  # m
-    contact_force: Amount = 2000.0  # N for the G1, in proportion to the mass for another robot
+    contact_force: BodyWeights = 6.114775503760825  # body weights: 2000 N for the G1
 
 
 @dataclass(frozen=True)

@@ -35,13 +35,7 @@ def make_setup(config: Config) -> Setup:
     validate(config)
     if not jax.config.values["jax_compilation_cache_dir"]:
         jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "jax"))
-    robot = load_robot(
-        config.robot,
-        timestep=config.physics.timestep,
-        solver_iterations=config.physics.solver_iterations,
-        line_search_iterations=config.physics.line_search_iterations,
-        self_collision=config.physics.self_collision,
-    )
+    robot = load_robot(config.robot, config.physics)
     folder = library_folder(config)
     library = load_library(robot, folder, fps=1.0 / config.physics.control_step)
     check_targets(config.unlearn.targets, library.names)

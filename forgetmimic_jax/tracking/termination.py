@@ -8,7 +8,7 @@ from jax import Array
 from forgetmimic_jax.basics import rotation
 from forgetmimic_jax.motion.library import Frames
 from forgetmimic_jax.physics import BodyState
-from forgetmimic_jax.robot.model import Robot, relative_mass
+from forgetmimic_jax.robot.model import Robot
 from forgetmimic_jax.settings.config import TerminationConfig
 from forgetmimic_jax.tracking.reference import AlignedBodies
 
@@ -20,10 +20,7 @@ def terminations(
     bodies: BodyState,
     robot: Robot,
 ) -> dict[str, Array]:
-    """Which bound each environment breaks: name → bool [env].
-
-    That of the contact force, stated for the G1, grows with the robot's mass: a heavier one lands as much harder.
-    """
+    """Which bound each environment breaks: name → bool [env]."""
     anchor, end_effectors = robot.anchor, jnp.asarray(robot.end_effectors)
     ref_quat, quat = reference.bodies.quat[:, anchor], bodies.quat[:, anchor]
     if config.orientation_rule == "gravity_z":
@@ -38,5 +35,5 @@ def terminations(
         "anchor_height": jnp.abs(reference.bodies.pos[:, anchor, 2] - bodies.pos[:, anchor, 2]) > config.anchor_height,
         "orientation": tilt > config.orientation,
         "end_effector_height": (heights > config.end_effector_height).any(-1),
-        "contact_force": (forces > config.contact_force * relative_mass(robot.model)).any(-1),
+        "contact_force": (forces > config.contact_force * robot.weight).any(-1),
     }

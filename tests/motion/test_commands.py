@@ -9,8 +9,8 @@ from motion_cases import waving
 from PIL import Image
 
 from forgetmimic_jax import motions
-from forgetmimic_jax.basics.errors import run_command
-from forgetmimic_jax.motion import library
+from forgetmimic_jax.basics.errors import InputError, run_command
+from forgetmimic_jax.motion import importing, library
 from forgetmimic_jax.settings.options import parse
 
 
@@ -75,6 +75,22 @@ def test_a_refused_import_writes_nothing(run, motion_file):
     assert err.count("\n") == 1
     assert not (motion_file.parent / "mine").exists()
     assert not (motion_file.parent / "runs").exists()
+
+
+def test_nothing_is_written_where_a_later_check_fails(run, motion_file, monkeypatch):
+    def fails(*_):
+        raise InputError("a shape that cannot be measured")
+
+    monkeypatch.setattr(importing, "measure", fails)
+    code, _, err = run("import", motion_file, "--library", "mine")
+    assert (code, err) == (2, "error: a shape that cannot be measured\n")
+    assert not (motion_file.parent / "mine").exists()
+
+
+def test_a_name_that_is_taken_is_told_before_the_file_is_read(run, motion_file):
+    assert run("import", motion_file, "--library", "mine")[0] == 0
+    motion_file.write_bytes(b"no pickle")
+    assert "already has a clip 'wave'" in run("import", motion_file, "--library", "mine")[2]
 
 
 def test_check_passes_the_shipped_library_and_draws_it(run, tmp_path):

@@ -4,21 +4,16 @@ import dataclasses
 
 import mujoco
 import numpy as np
-import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from forgetmimic_jax.motion.clip import Clip, continuous
 from forgetmimic_jax.motion.kinematics import (
-    PlanarTransform,
     angular_velocity,
     body_motion,
     configuration,
-    heading,
     rate,
     resample,
     rotation,
-    tile,
-    wrap_angle,
 )
 
 
@@ -86,30 +81,3 @@ def test_body_motion_is_mujoco_s_kinematics(robot):
     mujoco.mj_kinematics(robot.model, data)
     motion = body_motion(robot.model, configuration(clip, robot), 30.0, robot.key_body_ids)
     np.testing.assert_allclose(motion.pos[7], data.xpos[robot.key_body_ids], atol=1e-12)
-
-
-@pytest.mark.parametrize("yaw", [0.0, 0.5, np.pi])
-def test_planar_transform_power(yaw):
-    step = PlanarTransform(yaw, np.array([1.0, 2.0]))
-    pos = np.array([[0.3, -0.4, 0.9]])
-    np.testing.assert_allclose(step.power(3).apply(pos), step.apply(step.apply(step.apply(pos))))
-
-
-@pytest.mark.parametrize("yaw", [0.0, 0.7])
-def test_tiling_a_motion_that_walks_a_circle_has_no_seam(robot, yaw):
-    """A cycle of 25 frames on a circle (a line for yaw 0): tiled, speed and turn rate stay the same throughout."""
-    frames, fps = 25, 50.0
-    clip = moving(robot, frames, fps, velocity=(0.0, 0.0, 0.0), spin=(0.0, 0.0, yaw * fps / frames))
-    angle = yaw * np.arange(frames + 1) / frames
-    path = np.stack([np.sin(angle), 1 - np.cos(angle)], axis=-1) if yaw else np.linspace([0, 0], [1, 0], frames + 1)
-    clip.root_pos[:, :2] = path[:-1]
-    clip.joint_pos[:, 0] += 0.1 * np.sin(2 * np.pi * np.arange(frames) / frames)
-    tiled = tile(clip, PlanarTransform(yaw, path[-1]), 10.0)
-    assert tiled.num_frames == 500
-    step = np.linalg.norm(np.diff(tiled.root_pos[:, :2], axis=0), axis=-1)
-    np.testing.assert_allclose(step, step[0], atol=1e-9)
-    np.testing.assert_allclose(angular_velocity(tiled.root_quat, fps)[:, 2], yaw * fps / frames, atol=1e-6)
-    expected = 0.1 * np.sin(2 * np.pi * np.arange(500) / frames)
-    np.testing.assert_allclose(tiled.joint_pos[:, 0] - robot.arrays.default_joint_pos[0], expected, atol=1e-6)
-    turned = wrap_angle(heading(rotation(tiled.root_quat)) - yaw * np.arange(500) / frames)
-    np.testing.assert_allclose(turned, 0.0, atol=1e-6)

@@ -8,7 +8,7 @@ import pytest
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.motion.contact import floor_points, floor_positions
 from forgetmimic_jax.motion.kinematics import configuration
-from forgetmimic_jax.motion.readers import read_motion
+from forgetmimic_jax.motion.readers import Reading, read_motion
 
 YAW_90 = [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]  # xyzw
 
@@ -47,10 +47,14 @@ def write_pickle(path, content):
     return path
 
 
+def read(robot, path, **options):
+    return read_motion(robot, path, Reading(**options))
+
+
 def message(robot, path, **options):
     """The error's text: one line that names the file."""
     with pytest.raises(InputError) as caught:
-        read_motion(robot, path, **options)
+        read(robot, path, **options)
     text = str(caught.value)
     assert "\n" not in text
     assert str(path) in text
@@ -60,7 +64,7 @@ def message(robot, path, **options):
 def test_csv_columns_land_where_the_format_says(robot, tmp_path):
     rows = standing_rows(robot)
     rows[:, 7 + robot.joint_names.index("left_elbow_joint")] = 0.75
-    clip = read_motion(robot, write_csv(tmp_path / "a.csv", rows), fps=30.0)
+    clip = read(robot, write_csv(tmp_path / "a.csv", rows), fps=30.0)
     assert (clip.name, clip.fps, clip.num_frames) == ("a", 30.0, 5)
     np.testing.assert_allclose(clip.root_pos[0], [0.1, 0.2, robot.default_height])
     np.testing.assert_allclose(clip.root_quat[0], [np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
@@ -69,12 +73,12 @@ def test_csv_columns_land_where_the_format_says(robot, tmp_path):
 
 def test_csv_with_a_header_line(robot, tmp_path):
     path = write_csv(tmp_path / "a.csv", standing_rows(robot), header=",".join(f"c{i}" for i in range(36)))
-    assert read_motion(robot, path, fps=30.0).num_frames == 5
+    assert read(robot, path, fps=30.0).num_frames == 5
 
 
 def test_the_sample_csv(robot, samples):
     """M_ShortMove12: 467 rows at 60 Hz, first row read by eye; the soles stay within 5 cm of the floor."""
-    clip = read_motion(robot, samples / "M_ShortMove12.csv", fps=60.0)
+    clip = read(robot, samples / "M_ShortMove12.csv", fps=60.0)
     assert clip.num_frames == 467
     np.testing.assert_allclose(clip.root_pos[0], [-0.012863, -0.074445, 0.816294])
     np.testing.assert_allclose(np.abs(clip.root_quat[0]), [0.712386, 0.051651, 0.012808, 0.699767], atol=1e-5)
@@ -86,7 +90,7 @@ def test_the_sample_csv(robot, samples):
 def test_the_sample_npz(robot, samples):
     path = samples / "B_HandsUp_mjlab.npz"
     assert "--assume-robot-order" in message(robot, path)
-    clip = read_motion(robot, path, assume_robot_order=True)
+    clip = read(robot, path, assume_robot_order=True)
     assert (clip.fps, clip.num_frames) == (60.0, 441)
     np.testing.assert_allclose(clip.root_quat[0], [0.723328, -0.06149, -0.001253, -0.687761], atol=1e-5)
 
@@ -99,7 +103,7 @@ def test_an_npz_without_names_in_another_order_is_refused(robot, samples, tmp_pa
 
 
 def test_the_sample_pickle(robot, samples):
-    clip = read_motion(robot, samples / "yanjie_walk_001_gmr.pkl")
+    clip = read(robot, samples / "yanjie_walk_001_gmr.pkl")
     assert clip.num_frames == 416
     assert clip.fps == pytest.approx(29.876, abs=1e-3)
     np.testing.assert_allclose(np.abs(clip.root_quat[0]), [0.367963, 0.038254, 0.010478, 0.928994], atol=1e-5)
@@ -111,7 +115,7 @@ def test_an_npz_s_joints_are_matched_by_name(robot, tmp_path):
     fields["joint_pos"][:, 3] = 0.25
     reverse = {**fields, "joint_names": fields["joint_names"][::-1], "joint_pos": fields["joint_pos"][:, ::-1]}
     np.savez(tmp_path / "reverse.npz", **reverse)
-    clip = read_motion(robot, tmp_path / "reverse.npz")
+    clip = read(robot, tmp_path / "reverse.npz")
     assert clip.joint_names == robot.joint_names
     np.testing.assert_allclose(clip.joint_pos, fields["joint_pos"])
 
@@ -148,7 +152,7 @@ def test_a_quaternion_in_the_wrong_order_is_noticed(robot, tmp_path):
     rows[:, 3:7] = np.roll(rows[:, 3:7], 1, axis=-1)
     path = write_csv(tmp_path / "wxyz.csv", rows)
     assert "--quaternion-order" in message(robot, path, fps=30.0)
-    clip = read_motion(robot, path, fps=30.0, quaternion_order="wxyz")
+    clip = read(robot, path, fps=30.0, quaternion_order="wxyz")
     np.testing.assert_allclose(clip.root_quat[0], [np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
 
 
@@ -164,7 +168,7 @@ def test_an_npz_that_is_no_motion(robot, tmp_path):
         np.savez(path, **{field: value for field, value in {**fields, **changes}.items() if value is not None})
         return path
 
-    assert read_motion(robot, with_changes()).num_frames == 5
+    assert read(robot, with_changes()).num_frames == 5
     assert "missing fps" in message(robot, with_changes(fps=None))
     assert "missing joint_pos" in message(robot, with_changes(joint_pos=None))
     assert "joint_names" in message(robot, with_changes(joint_names=None))
@@ -186,7 +190,7 @@ def test_an_npz_that_is_no_motion(robot, tmp_path):
 
 def test_a_pickle_that_is_no_motion(robot, tmp_path):
     path, fields = tmp_path / "a.pkl", gmr_fields(robot)
-    assert read_motion(robot, write_pickle(path, fields)).fps == 30.0
+    assert read(robot, write_pickle(path, fields)).fps == 30.0
     assert "missing fps" in message(robot, write_pickle(path, {k: v for k, v in fields.items() if k != "fps"}))
     assert "28 joints" in message(robot, write_pickle(path, {**fields, "dof_pos": fields["dof_pos"][:, :-1]}))
     assert "root_rot" in message(robot, write_pickle(path, {**fields, "root_rot": fields["root_rot"][:, :3]}))

@@ -15,6 +15,7 @@ from physics_cases import CASES, FLIGHT, SUBSTEPS
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.physics.mjx import WARP_CONSTRAINTS, WARP_CONTACTS, MjxEngine
 from forgetmimic_jax.robot.model import load_robot
+from forgetmimic_jax.settings.config import PhysicsConfig
 
 HANG = 600  # s: far above any compilation here
 # Half the compilation, the same program.
@@ -124,7 +125,7 @@ def test_only_pairs_of_floor_and_robot_make_contacts(robot, engine):
     capsules = int((touches & (model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE)).sum())
     assert spheres + capsules == touches.sum()
     assert engine.num_contacts == spheres + 2 * capsules  # a capsule lies on a plane with both ends
-    assert MjxEngine(load_robot("g1", self_collision=True), SUBSTEPS).num_contacts > engine.num_contacts
+    assert MjxEngine(load_robot("g1", PhysicsConfig(self_collision=True)), SUBSTEPS).num_contacts > engine.num_contacts
 
 
 def test_warp_has_room_for_every_contact_and_joint_limit(robot, engine):

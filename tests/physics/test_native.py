@@ -23,6 +23,7 @@ from physics_cases import (
 from forgetmimic_jax.physics import BodyState
 from forgetmimic_jax.physics.native import NativeEngine
 from forgetmimic_jax.robot.model import load_robot
+from forgetmimic_jax.settings.config import PhysicsConfig
 
 SINGLE = {"rtol": 2e-6, "atol": 2e-6}  # the engine computes in double precision and rounds its outputs once
 
@@ -112,7 +113,7 @@ def momentum(model, data) -> np.ndarray:
 def test_wrench_is_a_force_and_torque_on_the_anchors_centre_of_mass_in_the_world_frame(inputs):
     """A wrench of M g holds the centre of mass in free fall; its torque and lever arm turn the robot."""
     fine, substeps = 1e-4, 10  # s: momentum is kept but for the integrator's error, which is of the order of the step
-    robot = load_robot("g1", timestep=fine)
+    robot = load_robot("g1", PhysicsConfig(timestep=fine))
     model = plain_model(robot, inputs, LIFTED)
     data = plain_data(robot, model, inputs, LIFTED)
     mujoco.mj_kinematics(model, data)

@@ -7,16 +7,20 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from forgetmimic_jax.motion.contact import floor_points, floor_positions, human_contact
-from forgetmimic_jax.motion.deepmimic import LEG_LENGTH, forward_kinematics, read_deepmimic
-from forgetmimic_jax.motion.dynamics import FRICTION, RADIUS, floor_answer, floor_wrench
-from forgetmimic_jax.motion.kinematics import PlanarTransform, generalized_velocity, heading
-from forgetmimic_jax.motion.least_squares import Term, gauss_newton_step
-from forgetmimic_jax.motion.motors import InverseDynamics, motor_loads, motor_torque, wrists
-from forgetmimic_jax.motion.timeline import Timeline
+from forgetmimic_jax.motion.contact import floor_points, floor_positions
+from forgetmimic_jax.motion.dynamics import FRICTION, RADIUS, floor_answer
+from forgetmimic_jax.motion.kinematics import generalized_velocity
+from forgetmimic_jax.motion.motors import InverseDynamics, motor_loads
+from forgetmimic_jax.retarget.contact import human_contact
 from forgetmimic_jax.retarget.cycle import resampled
-from forgetmimic_jax.retarget.refine import Weights, _Problem, refine
+from forgetmimic_jax.retarget.deepmimic import LEG_LENGTH, forward_kinematics, read_deepmimic
+from forgetmimic_jax.retarget.dynamics import floor_wrench, motor_torque
+from forgetmimic_jax.retarget.least_squares import Term, gauss_newton_step
+from forgetmimic_jax.retarget.planar import PlanarTransform, heading
+from forgetmimic_jax.retarget.pose import pose_of
+from forgetmimic_jax.retarget.refine import Problem, Weights, refine
 from forgetmimic_jax.retarget.retarget import inverse_kinematics, leg_scale, make_targets
+from forgetmimic_jax.retarget.timeline import Timeline
 
 FPS = 50.0
 
@@ -37,15 +41,14 @@ def human(tmp_path, frames, *, loop="none", yaw=0.0, height=LEG_LENGTH, pitch=0.
     return read_deepmimic(path)
 
 
-def problem_of(robot, motion, weights=None):
+def problem_of(robot, motion):
     moved, step = resampled(motion, FPS, 1.0)
     pose = forward_kinematics(moved)
     targets = make_targets(robot, pose)
     if step is not None:
         step = PlanarTransform(step.yaw, step.shift * leg_scale(robot))
-    timeline = Timeline(targets.num_frames, step)
-    contact = human_contact(pose, FPS)
-    problem = _Problem(robot, targets, contact, floor_points(robot), FPS, timeline, weights or Weights(), 0.02, 0.8)
+    timeline = Timeline(targets.num_frames, step, FPS)
+    problem = Problem.of(robot, targets, human_contact(pose, FPS), timeline, Weights())
     return problem, inverse_kinematics(robot, targets)
 
 
@@ -128,14 +131,8 @@ def test_the_floor_carries_what_stands_over_its_points():
 
 
 def wrench_of(robot, qpos, *, flight):
-    problem = _Problem(robot, None, None, floor_points(robot), FPS, Timeline(len(qpos), None), Weights(), 0.02, 0.8)
-    pose = problem.pose(qpos)
-    points = pose.points[:, robot.model.nbody :]
-    mass = float(robot.model.body_subtreemass[1])
-    flying = np.full(len(qpos), flight)
-    return floor_wrench(
-        problem.timeline, qpos, pose.com, pose.com_jac, pose.momentum, points, flying, mass, FPS, 1e-3
-    ), pose
+    pose = pose_of(robot, floor_points(robot), qpos)
+    return floor_wrench(robot, Timeline(len(qpos), None, FPS), pose, np.full(len(qpos), flight), 1e-3)
 
 
 def standing(robot, frames):
@@ -164,18 +161,18 @@ def loads_of(robot, qpos):
 def test_free_fall_and_standing_need_nothing(robot):
     time = np.arange(10) / FPS
     qpos = standing(robot, 10)
-    np.testing.assert_allclose(wrench_of(robot, qpos, flight=False)[0].residual, 0.0, atol=1e-9)
-    assert np.abs(wrench_of(robot, qpos, flight=True)[0].residual).max() > 1e-3  # nothing holds it up
+    np.testing.assert_allclose(wrench_of(robot, qpos, flight=False).residual, 0.0, atol=1e-9)
+    assert np.abs(wrench_of(robot, qpos, flight=True).residual).max() > 1e-3  # nothing holds it up
     qpos[:, 0] += 1.5 * time
     qpos[:, 2] += 0.5 + 2.0 * time - 0.5 * 9.81 * time**2
-    falling, _ = wrench_of(robot, qpos, flight=True)
+    falling = wrench_of(robot, qpos, flight=True)
     np.testing.assert_allclose(falling.residual, 0.0, atol=1e-9)
 
 
 def test_the_momentum_is_mujocos(robot):
     """The wrench's moment is the change of mj_subtreeVel's angular momentum."""
     qpos = tumbling(robot, np.random.default_rng(1), 40, wave=0.3, speed=3.0)
-    term, _ = wrench_of(robot, qpos, flight=True)
+    term = wrench_of(robot, qpos, flight=True)
     qvel = generalized_velocity(qpos, FPS)
     data, momentum = mujoco.MjData(robot.model), []
     for row in range(40):
@@ -205,7 +202,7 @@ def wrench_scale(robot, qpos):
 def test_a_held_arm_weighs_on_the_motors_above_it(robot):
     """By lever and weight: a motor that holds a body up in stance gives -axis . (lever x m g) of all beyond it."""
     qpos = standing(robot, 6)
-    qpos[:, 7:] += np.where(wrists(robot), 0.0, 0.3) * np.array(["arm" not in name for name in robot.joint_names])
+    qpos[:, 7:] += 0.3 * robot.motor_counts * np.array(["arm" not in name for name in robot.joint_names])
     qpos[:, 7:][:, ["shoulder_pitch" in name for name in robot.joint_names]] -= 1.2
     loads = loads_of(robot, qpos)
     data = mujoco.MjData(robot.model)
@@ -230,14 +227,12 @@ def test_the_motors_jacobian_is_the_lacks_slope(robot):
     """In the air, turning and waving, by central differences; little is lacking, so the robust weight hardly moves."""
     rng = np.random.default_rng(4)
     qpos = tumbling(robot, rng, 8, wave=0.4, speed=12.0)
-    problem = _Problem(robot, None, None, floor_points(robot), FPS, Timeline(8, None), Weights(), 0.02, 0.8)
-    points = slice(robot.model.nbody, None)
+    problem = Problem.of(robot, None, None, Timeline(8, None, FPS), Weights())
     share = 0.9 * np.abs(loads_of(robot, qpos)).max()
 
     def term(moved):
-        pose = problem.pose(moved)
-        given = (moved, pose.points[:, points], pose.points_jac[:, points], np.ones(8, bool), FPS)
-        return motor_torque(robot, problem.timeline, *given, share, 1.0)
+        pose = pose_of(robot, problem.floor, moved)
+        return motor_torque(robot, problem.timeline, pose, np.ones(8, bool), share=share, weight=1.0)
 
     direction = rng.normal(size=(8, robot.model.nv))
     here, size = term(qpos), 1e-7
@@ -279,13 +274,11 @@ def test_inverse_dynamics_undo_mujocos_own(robot):
 def test_a_motor_counts_beyond_its_share(robot):
     """The residual is what the load has over the share, and a share that no load reaches leaves nothing."""
     qpos = standing(robot, 6)
-    problem = _Problem(robot, None, None, floor_points(robot), FPS, Timeline(6, None), Weights(), 0.02, 0.8)
-    pose, points = problem.pose(qpos), slice(robot.model.nbody, None)
+    pose, timeline = pose_of(robot, floor_points(robot), qpos), Timeline(6, None, FPS)
     loads = loads_of(robot, qpos)
 
     def lack(share):
-        given = (qpos, pose.points[:, points], pose.points_jac[:, points], np.zeros(6, bool), FPS)
-        return motor_torque(robot, problem.timeline, *given, share, 1e-3).residual / 1e-3
+        return motor_torque(robot, timeline, pose, np.zeros(6, bool), share=share, weight=1e-3).residual / 1e-3
 
     np.testing.assert_allclose(lack(1.0), 0.0)
     share = 0.5 * np.abs(loads).max()
@@ -324,13 +317,11 @@ def test_a_cycle_closes(tmp_path, degrees, carried):
 def test_a_standing_human_makes_a_standing_robot(robot, tmp_path):
     """Both soles on the floor and still, the centre of mass over them, joints inside their limits."""
     problem, start = problem_of(robot, human(tmp_path, 12, wave=0.005))
-    qpos = refine(
-        robot, problem.targets, problem.contact, problem.floor, start, FPS, problem.timeline.step, iterations=15
-    )
+    qpos = refine(robot, problem.targets, problem.contact, start, problem.timeline, iterations=15)
     soles = floor_positions(robot, problem.floor, qpos)[:, problem.floor.is_sole]
     assert np.abs(soles[..., 2]).max() < 0.005
     assert (qpos[:, 7:] > robot.joint_lower).all()
     assert (qpos[:, 7:] < robot.joint_upper).all()
-    com = problem.pose(qpos).com
+    com = pose_of(robot, problem.floor, qpos).com
     assert (com[:, :2] > soles[..., :2].min(axis=1)).all()
     assert (com[:, :2] < soles[..., :2].max(axis=1)).all()

@@ -10,8 +10,8 @@ import pytest
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.motion import library
 from forgetmimic_jax.motion.clip import read_clip
-from forgetmimic_jax.motion.deepmimic import forward_kinematics, read_deepmimic
 from forgetmimic_jax.retarget import recipe
+from forgetmimic_jax.retarget.deepmimic import forward_kinematics, read_deepmimic
 
 
 def frame(duration=0.1, height=0.9):

@@ -5,10 +5,10 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-import yaml
 
 from forgetmimic_jax.basics.errors import InputError
-from forgetmimic_jax.robot.model import CONTACT_SENSOR, ROBOTS_DIR, VISUAL_GROUP, load_robot, read_spec, robot_names
+from forgetmimic_jax.robot.model import CONTACT_SENSOR, VISUAL_GROUP, load_robot, read_spec
+from forgetmimic_jax.settings.config import PhysicsConfig
 
 REFERENCES = Path(__file__).resolve().parents[3] / "shared/data/robots"
 
@@ -179,7 +179,7 @@ def test_a_robot_stands_on_its_soles_in_the_default_pose(name, request):
 
 @pytest.mark.parametrize("name", ["g1", "h2"])
 def test_a_robot_touches_nothing_of_itself_in_the_default_pose(name):
-    robot = load_robot(name, self_collision=True)
+    robot = load_robot(name, PhysicsConfig(self_collision=True))
     data = mujoco.MjData(robot.model)
     data.qpos[:7] = [0, 0, 2.0, 1, 0, 0, 0]
     data.qpos[7:] = robot.arrays.default_joint_pos
@@ -218,7 +218,7 @@ def test_shapes_to_be_seen_weigh_nothing_touch_nothing_and_are_not_simulated(nam
 
 
 def test_only_the_floor_is_touched_unless_self_collision_is_asked_for(g1):
-    other = load_robot("g1", self_collision=True)
+    other = load_robot("g1", PhysicsConfig(self_collision=True))
     shapes = np.flatnonzero(g1.model.geom_bodyid > 0)
     assert not g1.model.geom_contype[shapes].any()
     assert other.model.geom_contype[shapes].any()
@@ -233,51 +233,3 @@ def test_every_key_body_has_a_contact_sensor(g1):
 def test_unknown_robot_suggests_the_nearest():
     with pytest.raises(InputError, match=r"robot 'g11': .*did you mean 'g1'\?"):
         load_robot("g11")
-
-
-@pytest.fixture
-def edited(tmp_path):
-    """Load the G1 after one edit of its roles."""
-
-    def load(edit):
-        folder = tmp_path / "g1"
-        folder.mkdir()
-        (folder / "g1.xml").write_text((ROBOTS_DIR / "g1/g1.xml").read_text())
-        roles = yaml.safe_load((ROBOTS_DIR / "g1/g1.yaml").read_text())
-        edit(roles)
-        (folder / "g1.yaml").write_text(yaml.safe_dump(roles))
-        assert robot_names(tmp_path) == ["g1"]
-        return load_robot("g1", robots_dir=tmp_path)
-
-    return load
-
-
-@pytest.mark.parametrize(
-    ("edit", "message"),
-    [
-        (lambda roles: roles.pop("anchor"), "missing field 'anchor'"),
-        (lambda roles: roles.update(anchor="torso"), "anchor: 'torso' must be among key_bodies"),
-        (lambda roles: roles["key_bodies"].append("left_foo_link"), "key_bodies: no body 'left_foo_link'"),
-        (lambda roles: roles["key_bodies"].remove("pelvis"), "the floating base 'pelvis' must be among them"),
-        (lambda roles: roles["feet"].append("head_link"), "feet: no body 'head_link'"),
-        (lambda roles: roles["end_effectors"].append("waist_yaw_link"), "end_effectors: .* must be among key_bodies"),
-        (lambda roles: roles["default_pose"].update(left_kneee_joint=0.1), "did you mean 'left_knee_joint'"),
-        (lambda roles: roles["joint_motors"].pop(0), "no pattern matches joint 'left_hip_pitch_joint'"),
-        (lambda roles: roles["joint_motors"].insert(0, [".*", "nuclear"]), "joint_motors: no motor 'nuclear'"),
-        (lambda roles: roles["motors"]["arm"].pop("effort"), "motors: arm: missing 'effort'"),
-        (lambda roles: roles.update(model="g2.xml"), "model: no file 'g2.xml'"),
-    ],
-)
-def test_broken_roles_are_one_clear_line(edited, edit, message):
-    with pytest.raises(InputError, match=message) as error:
-        edited(edit)
-    assert "g1.yaml" in str(error.value)
-    assert "\n" not in str(error.value)
-
-
-def test_a_yaml_that_cannot_be_read_is_one_clear_line(tmp_path):
-    (tmp_path / "g1").mkdir()
-    (tmp_path / "g1/g1.yaml").write_text("name: [g1\n")
-    with pytest.raises(InputError, match=r"g1\.yaml: not YAML") as error:
-        load_robot("g1", robots_dir=tmp_path)
-    assert "\n" not in str(error.value)

@@ -8,6 +8,7 @@ from forgetmimic_jax.settings.checked import from_dict
 from forgetmimic_jax.settings.config import (
     Config,
     PPOConfig,
+    TerminationConfig,
     UnlearnConfig,
     config_hash,
     load_config,
@@ -185,6 +186,10 @@ def test_the_file_is_plain_yaml(path):
                 unlearn=UnlearnConfig(targets=("kick",)),
             ),
             "sampling.target_share: found 0.5 with sampling.clips = kept; accepted: 0, or a share where",
+        ),
+        (
+            dataclasses.replace(Config(), termination=TerminationConfig(contact_force=2000.0)),
+            "termination.contact_force: found 2000.0; accepted: 0 to 100 body weights",
         ),
         (dataclasses.replace(Config(), seed=-1), "seed: found -1; accepted: a whole number from 0 to 4294967295"),
         (

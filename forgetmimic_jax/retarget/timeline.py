@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from forgetmimic_jax.motion.kinematics import PlanarTransform, rotation
+from forgetmimic_jax.motion.kinematics import rotation
+from forgetmimic_jax.retarget.planar import PlanarTransform
 
 
 @dataclass(frozen=True)
@@ -16,6 +17,7 @@ class Timeline:
 
     frames: int
     step: PlanarTransform | None
+    fps: float
 
     @property
     def cyclic(self) -> bool:

@@ -1,0 +1,82 @@
+"""Whether a robot's YAML fits its MJCF."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
+
+import mujoco
+
+from forgetmimic_jax.basics.errors import nearest
+from forgetmimic_jax.robot.sides import body_ids, side_problems
+
+FLOOR = "floor"  # the name of the ground's geom
+
+
+def misfits(roles: Mapping[str, Any], model: mujoco.MjModel) -> Iterator[str]:
+    """What is at odds, a line each.
+
+    Args:
+        roles: the fields of the YAML that could be read, as `Roles` holds them.
+        model: the MJCF, compiled.
+    """
+    hinges = model.jnt_type[1:] == mujoco.mjtJoint.mjJNT_HINGE
+    if model.njnt < 2 or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE or not hinges.all():
+        yield f"model: {roles['model']} must have one free joint first and hinge joints only"
+        return
+    if FLOOR not in [model.geom(geom).name for geom in range(model.ngeom)]:
+        yield f"model: {roles['model']} has no geom '{FLOOR}'"
+    joints = [model.joint(joint).name for joint in range(1, model.njnt)]
+    endless = [joint for joint, limited in zip(joints, model.jnt_limited[1:], strict=True) if not limited]
+    if endless:
+        yield f"model: no range of joint {_quoted(endless)}"
+    yield from _bodies(roles, model)
+    yield from _joints(roles, joints)
+
+
+def first_match(rules: Iterable[tuple[str, str]], joint: str) -> str | None:
+    """The second of the first (pattern, ...) whose pattern is the whole of the joint's name."""
+    return next((given for pattern, given in rules if re.fullmatch(pattern, joint)), None)
+
+
+def _bodies(roles: Mapping[str, Any], model: mujoco.MjModel) -> Iterator[str]:
+    bodies = [model.body(body).name for body in range(1, model.nbody)]
+    named: dict[str, tuple[str, ...]] = {field: roles.get(field, ()) for field in ("key_bodies", "end_effectors")}
+    named["anchor"] = (roles["anchor"],) if "anchor" in roles else ()
+    named |= {f"pairs: {role}": pair for role, pair in vars(roles["pairs"]).items()} if "pairs" in roles else {}
+    unknown = {field: [name for name in names if name not in bodies] for field, names in named.items()}
+    for field, names in unknown.items():
+        for name in names:
+            yield f"{field}: no body '{name}' in {roles['model']}; {nearest(name, bodies)}"
+    if "pairs" in roles and not any(unknown[field] for field in unknown if field.startswith("pairs")):
+        yield from (f"pairs: {line}" for line in side_problems(model, body_ids(model, roles["pairs"])))
+    if "key_bodies" not in roles:
+        return
+    for field in ("anchor", "end_effectors", "pairs: feet"):
+        for name in named.get(field, ()):
+            if name not in roles["key_bodies"] and name not in unknown[field]:
+                yield f"{field}: '{name}' must be among key_bodies"
+    if bodies[0] not in roles["key_bodies"]:
+        yield f"key_bodies: the floating base '{bodies[0]}' must be among them"
+
+
+def _joints(roles: Mapping[str, Any], joints: list[str]) -> Iterator[str]:
+    for joint in roles.get("default_pose", ()):
+        if joint not in joints:
+            yield f"default_pose: no joint '{joint}'; {nearest(joint, joints)}"
+    for pattern in roles.get("ignored_motors", ()):
+        if not any(re.fullmatch(pattern, joint) for joint in joints):
+            yield f"ignored_motors: no joint matches '{pattern}'"
+    if "joint_motors" not in roles:
+        return
+    if "motors" in roles:
+        for motor in sorted({motor for _, motor in roles["joint_motors"]} - set(roles["motors"])):
+            yield f"joint_motors: no motor '{motor}'; {nearest(motor, roles['motors'])}"
+    motorless = [joint for joint in joints if first_match(roles["joint_motors"], joint) is None]
+    if motorless:
+        yield f"joint_motors: no pattern matches joint {_quoted(motorless)}"
+
+
+def _quoted(names: list[str]) -> str:
+    return ", ".join(f"'{name}'" for name in names)
