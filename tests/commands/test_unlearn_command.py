@@ -12,6 +12,7 @@ from trees import assert_same
 from forgetmimic_jax import train, unlearn
 from forgetmimic_jax.basics.errors import Interrupted, run_command
 from forgetmimic_jax.basics.files import read_rows
+from forgetmimic_jax.basics.provenance import provenance
 from forgetmimic_jax.evaluation import evaluate as evaluation
 from forgetmimic_jax.motion.library import DATA_DIR, read_manifest
 from forgetmimic_jax.settings.config import load_config, validate
@@ -103,6 +104,11 @@ def test_the_evaluation_has_the_documented_form(base_run, unlearned_run):
         "budget": {
             "base": {"environment_steps": 128},
             "unlearned": {"environment_steps": 192},
+        },
+        "made": dataclasses.asdict(provenance()),
+        "policy_hashes": {
+            "base": checkpoint.policy_hash(checkpoint.read_info(base_run.checkpoint(4))),
+            "unlearned": checkpoint.policy_hash(checkpoint.read_info(unlearned_run.checkpoint(2))),
         },
     }
     assert policies.keys() == {"base", "unlearned", "zero_action"}
