@@ -26,14 +26,8 @@ from forgetmimic_jax.training.checkpoint import policy_hash
 from forgetmimic_jax.unlearning.registry import find_method, method_of, methods
 
 RELEARNED = 0.8  # of the base's tracking on the targets
-FIRST = (
-    "robot",
-    "unlearn.method",
-    "unlearn.targets",
-    "unlearn.settings.penalty",
-    "iterations",
-    "preset",
-)  # named before others
+# Settings whose difference is named before another's.
+FIRST = ("robot", "unlearn.method", "unlearn.targets", "unlearn.settings.penalty", "iterations", "preset")
 COMPETENT = f"a control needs at least {100 * KEPT:.0f} % of it, with its whole interval"
 
 

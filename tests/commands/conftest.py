@@ -10,6 +10,7 @@ from miniature import TINY, Run, finished
 
 from forgetmimic_jax import train, unlearn
 from forgetmimic_jax.basics.errors import run_command
+from forgetmimic_jax.settings.config import config_hash
 from forgetmimic_jax.training import run
 
 
@@ -19,7 +20,7 @@ def compiled_once() -> Iterator[None]:
     make, compiled = run.make_iteration, {}
 
     def shared(env, rule):
-        key = dataclasses.replace(env.config, iterations=1, checkpoint_every=1, base=None, seed=0)
+        key = config_hash(dataclasses.replace(env.config, seed=0))
         return compiled.setdefault(key, make(env, rule))
 
     with pytest.MonkeyPatch.context() as patch:

@@ -81,7 +81,7 @@ def test_the_page_tells_what_was_asked_done_and_found(page, run, base_run):
     for said in (
         "is to forget turn and to keep the other 2 clips (nod, sway).",
         "arft: Anti-reward fine-tuning, the paper&#39;s method",
-        "<th>Penalty λ</th><td>16</td>",
+        "<th>Penalty</th><td>16</td>",
         "2 iterations, 192 environment steps, 8 environments",
         "<th>Base&#39;s training</th><td>128 environment steps</td>",
         "0 (unlearning), 0 (evaluation)",
@@ -114,7 +114,7 @@ def test_the_facts_lie_beside_it(facts, run):
     assert facts["verdict"]["phrase"] in RULES
     assert facts["rules"] == RULES
     assert facts["evaluation"] == json.loads((run / "evaluation.json").read_text())
-    assert facts["done"]["Penalty λ"] == "16"
+    assert facts["done"]["Penalty"] == "16"
     assert facts["done"]["KL to the base"] == "weight 0.1, on kept clips"
 
 
