@@ -26,9 +26,9 @@ from forgetmimic_jax.settings.options import (
 class Options:
     """Make a base policy forget the target clips, by default with the anti-reward, then evaluate before and after.
 
-    Uniform sampling, no assistive wrench, Adam reset (the paper's ForgetMimic); at laptop scale kept clips are held to
-    the base and targets have half of the starts (--set ppo.anchor=0 sampling.target_share=0 leaves both out). Stop with
-    Ctrl-C, go on with --resume.
+    Uniform sampling, no assistive wrench, Adam reset (the paper's ForgetMimic). At laptop scale a KL term keeps the
+    kept clips close to the base, and targets have half of the starts (--set ppo.base_kl=0 sampling.target_share=0
+    leaves both out). Ctrl-C saves and stops; --resume continues.
     """
 
     robot: str = "g1"

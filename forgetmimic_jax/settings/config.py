@@ -163,12 +163,12 @@ class PPOConfig:
     max_learning_rate: Positive = 1e-2
     discount: Share = 0.99
     gae_lambda: Share = 0.95
-    clip: Positive = 0.2
+    clip_range: Positive = 0.2
     entropy_cost: Amount = 0.005
     value_cost: Amount = 1.0
     clip_value: bool = True
     equal_clips: bool = False  # every clip weighs the same in the losses, however few of the steps are its
-    anchor: Amount = 0.0  # weight of KL(π ‖ π_base) on the kept clips' steps, while unlearning
+    base_kl: Amount = 0.0  # weight of KL(π ‖ π_base) on the kept clips' steps, while unlearning
     max_gradient_norm: Positive = 1.0
     actor_layers: tuple[Count, ...] = (1024, 512, 256, 128)
     critic_layers: tuple[Count, ...] = (1024, 1024, 512, 256)
