@@ -32,7 +32,7 @@ from forgetmimic_jax.settings.checked import (
     from_dict,
 )
 
-Engine = Literal["auto", "native", "mjx", "mjx-warp"]
+EngineName = Literal["auto", "native", "mjx", "mjx-warp"]
 Preset = Literal["cpu", "paper"]
 
 
@@ -40,7 +40,7 @@ Preset = Literal["cpu", "paper"]
 class PhysicsConfig:
     """Simulation (paper, appendix 'Simulation')."""
 
-    engine: Engine = "auto"  # auto: native on a CPU, mjx on a GPU or TPU
+    engine: EngineName = "auto"  # auto: native on a CPU, mjx on a GPU or TPU
     timestep: Positive = 0.005  # s
     substeps: Count = 4  # physics steps per control step: 50 Hz control
     solver_iterations: Count = 10
