@@ -1,8 +1,8 @@
 # Every command of the README. The first one makes .venv (once, a few minutes); after that each starts at once.
 # Works with GNU make 3.81 (macOS) and later.
 
-# `make TARGET VARIABLE=value ...`: a variable is a flag of the target's command, SEED=1 is --seed 1; a command keeps its own
-# default for what is not given.
+# `make TARGET VARIABLE=value ...`: a variable is a flag of the target's command, so SEED=1 is --seed 1. The command has
+# its own default for every flag that is not given.
 ## ROBOT        a folder under robots/ (default: g1)
 ## TARGETS      clips to forget, comma-separated (default: the robot's; g1: punch,kick)
 ## METHOD       how to forget; `make unlearn ARGS=--help` names them (default: arft)
@@ -18,7 +18,7 @@
 ## ARGS         flags as they are, and what comes before them; ARGS=--help lists all flags
 ## PYTHON       the Python that .venv is made from, 3.11 to 3.14 (default: the first found)
 PROGRAM = .venv/bin/python -m forgetmimic_jax
-SWITCHES = RESUME WRENCH DRAW DRY FORCE
+SWITCHES = RESUME WRENCH DRAW DRY FORCE MIX_COMMITS
 
 # The variables of the command line as flags; a switch has no value.
 given = $(foreach name,$(.VARIABLES),$(if $(filter command,$(origin $(name))),$(name)))

@@ -48,7 +48,7 @@ def measure(lab: Lab) -> dict[str, Any]:
     # A start's own settings would be its training's: all of them relearn at the same fixed pace and held by nothing. On
     # a laptop the targets have as many of the starts as in unlearning: whoever wants them back would do the same.
     on_laptop = lab.options.budget == "cpu"
-    pace = {**SHORT, "schedule": "fixed", "anchor": 0.0} if on_laptop else {}
+    pace = {**SHORT, "schedule": "fixed", "base_kl": 0.0} if on_laptop else {}
     alike = [f"ppo.{name}={json.dumps(value)}" for name, value in pace.items()]
     alike += ["wrench.max_gain=0.0", f"sampling.target_share={FINE_TUNING.target_share['cpu'] if on_laptop else 0.0}"]
     watched = {"clips": "all", "set": [*lab.watched(EVALUATIONS), *alike]}

@@ -15,7 +15,7 @@ from forgetmimic_jax.unlearning.method import FINE_TUNING
 ASKED_RATIO = 0.1  # of tracking, target over kept
 CONTROL = "fine-tuned, all clips"
 # The paper's loss and starts, at our step size and length.
-PLAIN = {"set": ["ppo.anchor=0.0", "ppo.equal_clips=false", "sampling.target_share=0.0"]}
+PLAIN = {"set": ["ppo.base_kl=0.0", "ppo.equal_clips=false", "sampling.target_share=0.0"]}
 
 
 def variants(lab: Lab) -> dict[str, dict[str, Any]]:

@@ -11,9 +11,9 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from forgetmimic_jax.basics.errors import InputError, run_command
+from forgetmimic_jax.settings.config import EngineName, Preset
 from forgetmimic_jax.settings.options import at_least, on_engine, parse, replace_given
 
 
@@ -23,9 +23,9 @@ class Options:
 
     robot: str = "g1"
     """Robot under robots/."""
-    preset: Literal["cpu", "paper"] = "cpu"
+    preset: Preset = "cpu"
     """Settings."""
-    physics: Literal["auto", "native", "mjx", "mjx-warp"] | None = None
+    physics: EngineName | None = None
     """Physics engine; auto is native on a CPU and mjx on a GPU or TPU."""
     library: Path | None = None
     """Folder of clips; data/ROBOT by default."""

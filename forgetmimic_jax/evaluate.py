@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from forgetmimic_jax.basics.errors import run_command
+from forgetmimic_jax.settings.config import EngineName
 from forgetmimic_jax.settings.options import at_least, comma_separated, parse
 
 
@@ -26,7 +26,7 @@ class Options:
     """Episodes a clip: half from frame 0, half spread over the clip."""
     seed: int = 0
     """Seed of start frames and reset noise; the same for every policy."""
-    physics: Literal["auto", "native", "mjx", "mjx-warp"] | None = None
+    physics: EngineName | None = None
     """Physics engine; auto is native on a CPU and mjx on a GPU or TPU."""
     library: Path | None = None
     """Folder of clips; the checkpoint's by default."""

@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from forgetmimic_jax.basics.errors import InputError, run_command
+from forgetmimic_jax.settings.config import Preset
 from forgetmimic_jax.settings.options import at_least, parse, replace_given
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ class Options:
     """Robot under robots/."""
     library: Path | None = None
     """Folder of the clips it was trained on; data/ROBOT by default."""
-    preset: Literal["cpu", "paper"] = "cpu"
+    preset: Preset = "cpu"
     """Settings for going on with it: cpu for a laptop, paper for a GPU."""
     activation: str | None = None
     """Activation of a .pt's hidden layers; by default what params/agent.yaml beside it says."""

@@ -96,8 +96,8 @@ def _commands(options: Options, subject: Subject) -> list[str]:
     changed = settings_changed(subject.info.config, unlearn.config_of_new_run(unlearn.Options(**flags)))
     comparisons = {name: getattr(options, name) for name in ("base", "control", "relearning")}
     return [
-        f".venv/bin/python -m forgetmimic_jax.unlearn {words(flags, changed)} --output {options.run}",
-        f".venv/bin/python -m forgetmimic_jax.report {words({'run': options.run, **comparisons})}",
+        f"forgetmimic unlearn {words(flags, changed)} --output {options.run}",
+        f"forgetmimic report {words({'run': options.run, **comparisons})}",
     ]
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 from forgetmimic_jax.basics.errors import run_command
+from forgetmimic_jax.settings.config import EngineName, Preset
 from forgetmimic_jax.settings.options import Settings, check_same, on_engine, override, parse, replace_given
 
 
@@ -17,13 +17,13 @@ class Options:
 
     robot: str = "g1"
     """Robot under robots/."""
-    preset: Literal["cpu", "paper"] = "cpu"
+    preset: Preset = "cpu"
     """Settings to start from: cpu for a laptop, paper for a GPU."""
     iterations: int | None = None
     """PPO iterations; the preset's by default."""
     seed: int | None = None
     """Random seed; 0 by default."""
-    physics: Literal["auto", "native", "mjx", "mjx-warp"] | None = None
+    physics: EngineName | None = None
     """Physics engine; auto is native on a CPU and mjx on a GPU or TPU."""
     library: Path | None = None
     """Folder of clips; data/ROBOT by default."""

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from forgetmimic_jax.basics.errors import InputError, run_command
-from forgetmimic_jax.settings.config import Config, UnlearnConfig, WrenchConfig, load_config, preset
+from forgetmimic_jax.settings.config import Config, EngineName, Preset, UnlearnConfig, WrenchConfig, load_config, preset
 from forgetmimic_jax.settings.options import (
     Settings,
     at_least,
@@ -26,9 +26,9 @@ from forgetmimic_jax.settings.options import (
 class Options:
     """Make a base policy forget the target clips, by default with the anti-reward, then evaluate before and after.
 
-    Uniform sampling, no assistive wrench, Adam reset (the paper's ForgetMimic); at laptop scale kept clips are held to
-    the base and targets have half of the starts (--set ppo.anchor=0 sampling.target_share=0 leaves both out). Stop with
-    Ctrl-C, go on with --resume.
+    Uniform sampling, no assistive wrench, Adam reset (the paper's ForgetMimic). At laptop scale a KL term keeps the
+    kept clips close to the base, and targets have half of the starts (--set ppo.base_kl=0 sampling.target_share=0
+    leaves both out). Ctrl-C saves and stops; --resume continues.
     """
 
     robot: str = "g1"
@@ -48,7 +48,7 @@ class Options:
     """Assist by the wrench, as strongly as the base's training did (at most 0.6 where it had none)."""
     clips: Literal["all", "kept"] | None = None
     """Clips that episodes start from; all by default; distill, retrain, finetune: kept."""
-    preset: Literal["cpu", "paper"] | None = None
+    preset: Preset | None = None
     """Settings of the fine-tuning; by default the base's own, at the default budget of a laptop."""
     iterations: int | None = None
     """PPO iterations; 640 by default (1000 with --preset paper), distill: 200,
@@ -59,7 +59,7 @@ class Options:
     """Checkpoint to start from; the shipped data/ROBOT/base by default."""
     episodes: int = 20
     """Evaluation episodes a clip."""
-    physics: Literal["auto", "native", "mjx", "mjx-warp"] | None = None
+    physics: EngineName | None = None
     """Physics engine; auto is native on a CPU and mjx on a GPU or TPU."""
     library: Path | None = None
     """Folder of clips; the base's by default."""

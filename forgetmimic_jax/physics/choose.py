@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import jax
 
 from forgetmimic_jax.physics.engine import Engine
 from forgetmimic_jax.robot.model import Robot
-from forgetmimic_jax.settings.config import PhysicsConfig
+from forgetmimic_jax.settings.config import EngineName, PhysicsConfig
 
 
-def resolve_engine(name: Literal["auto", "native", "mjx", "mjx-warp"]) -> str:
+def resolve_engine(name: EngineName) -> str:
     """`auto` becomes native on a CPU and mjx on a GPU or TPU."""
     if name != "auto":
         return name

@@ -38,7 +38,7 @@ class Batch:
 def ppo_loss(
     config: Config, batch: Batch, now: Prediction, iteration: Array | None = None
 ) -> tuple[Array, dict[str, Array]]:
-    """Clipped surrogate + value loss − entropy bonus + anchor [], to be minimised, and its parts.
+    """Clipped surrogate + value loss − entropy bonus + KL to the base [], to be minimised, and its parts.
 
     Args:
         config: coefficients.
@@ -48,33 +48,34 @@ def ppo_loss(
     """
     ppo = config.ppo
     log_ratio = log_prob(batch.transition.action, now.mean, now.log_std) - batch.transition.log_prob
-    policy_term = policy_loss(log_ratio, batch.advantage, ppo.clip, batch.weight)
+    policy_term = policy_loss(log_ratio, batch.advantage, ppo.clip_range, batch.weight)
     value_term = value_loss(
-        now.value, batch.value, batch.value_target, ppo.clip if ppo.clip_value else None, batch.weight
+        now.value, batch.value, batch.value_target, ppo.clip_range if ppo.clip_value else None, batch.weight
     )
     entropy_term = entropy(now.log_std)
     loss = policy_term + ppo.value_cost * value_term - ppo.entropy_cost * entropy_term
     metrics = {"policy_loss": policy_term, "value_loss": value_term, "entropy": entropy_term}
-    if ppo.anchor and batch.base is not None:
+    if ppo.base_kl and batch.base is not None:
         away = kl_divergence(now.mean, now.log_std, batch.base.mean, batch.base.log_std)
-        metrics["anchor_kl"] = mean(away, batch.weight * ~batch.is_target)
-        loss += ppo.anchor * metrics["anchor_kl"]
+        metrics["base_kl"] = mean(away, batch.weight * ~batch.is_target)
+        loss += ppo.base_kl * metrics["base_kl"]
     return loss, metrics
 
 
-def policy_loss(log_ratio: Array, advantage: Array, clip: float, weight: Array | None = None) -> Array:
+def policy_loss(log_ratio: Array, advantage: Array, clip_range: float, weight: Array | None = None) -> Array:
     """Clipped surrogate, to be minimised; arguments [batch], result []."""
     ratio = jnp.exp(log_ratio)
-    return -mean(jnp.minimum(ratio * advantage, jnp.clip(ratio, 1.0 - clip, 1.0 + clip) * advantage), weight)
+    clipped = jnp.clip(ratio, 1.0 - clip_range, 1.0 + clip_range)
+    return -mean(jnp.minimum(ratio * advantage, clipped * advantage), weight)
 
 
 def value_loss(
-    value: Array, old_value: Array, value_target: Array, clip: float | None, weight: Array | None = None
+    value: Array, old_value: Array, value_target: Array, clip_range: float | None, weight: Array | None = None
 ) -> Array:
-    """Mean squared error to the value target [batch]; with `clip` no better than of the value in old ± clip."""
+    """Mean squared error to the value target [batch]; with `clip_range` the larger of it and the clipped value's."""
     loss = (value - value_target) ** 2
-    if clip is not None:
-        clipped = old_value + jnp.clip(value - old_value, -clip, clip)
+    if clip_range is not None:
+        clipped = old_value + jnp.clip(value - old_value, -clip_range, clip_range)
         loss = jnp.maximum(loss, (clipped - value_target) ** 2)
     return mean(loss, weight)
 

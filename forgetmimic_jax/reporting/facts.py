@@ -46,8 +46,8 @@ def done(subject: Subject) -> dict[str, str]:
         "Sampler": f"{config.sampling.rule.replace('_', ' ')}, starts from {config.sampling.clips} clips",
         "Assistive wrench": f"up to {config.wrench.max_gain:g}" if config.wrench.max_gain else "off",
         "Weights in PPO's losses": "the same for every clip" if config.ppo.equal_clips else "the same for every step",
-        "KL to the base": f"weight {config.ppo.anchor:g}, on kept clips"
-        if subject.rows and "anchor_kl" in subject.rows[-1]  # some methods' losses have none
+        "KL to the base": f"weight {config.ppo.base_kl:g}, on kept clips"
+        if subject.rows and "base_kl" in subject.rows[-1]  # some methods' losses have none
         else "off",
         "Step size": f"{config.ppo.learning_rate:g}, {config.ppo.schedule}",
         "Seeds": f"{config.seed} (unlearning), {document.seed} (evaluation)",

@@ -33,7 +33,7 @@ from forgetmimic_jax.settings.checked import (
     from_dict,
 )
 
-Engine = Literal["auto", "native", "mjx", "mjx-warp"]
+EngineName = Literal["auto", "native", "mjx", "mjx-warp"]
 Preset = Literal["cpu", "paper"]
 
 
@@ -41,7 +41,7 @@ Preset = Literal["cpu", "paper"]
 class PhysicsConfig:
     """Simulation (paper, appendix 'Simulation')."""
 
-    engine: Engine = "auto"  # auto: native on a CPU, mjx on a GPU or TPU
+    engine: EngineName = "auto"  # auto: native on a CPU, mjx on a GPU or TPU
     timestep: Positive = 0.005  # s
     substeps: Count = 4  # physics steps per control step: 50 Hz control
     solver_iterations: Count = 10
@@ -164,12 +164,12 @@ class PPOConfig:
     max_learning_rate: Positive = 1e-2
     discount: Share = 0.99
     gae_lambda: Share = 0.95
-    clip: Positive = 0.2
+    clip_range: Positive = 0.2
     entropy_cost: Amount = 0.005
     value_cost: Amount = 1.0
     clip_value: bool = True
     equal_clips: bool = False  # every clip weighs the same in the losses, however few of the steps are its
-    anchor: Amount = 0.0  # weight of KL(π ‖ π_base) on the kept clips' steps, while unlearning
+    base_kl: Amount = 0.0  # weight of KL(π ‖ π_base) on the kept clips' steps, while unlearning
     max_gradient_norm: Positive = 1.0
     actor_layers: tuple[Count, ...] = (1024, 512, 256, 128)
     critic_layers: tuple[Count, ...] = (1024, 1024, 512, 256)

@@ -1,4 +1,4 @@
-"""What the commands' options have in common: preset, overrides and where a run goes."""
+"""What the options of the commands share: parsing, checks, and settings given with --set."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ import yaml
 
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.settings.checked import from_dict
-from forgetmimic_jax.settings.config import Config, Engine, PhysicsConfig, SamplingConfig, to_dict
+from forgetmimic_jax.settings.config import Config, EngineName, PhysicsConfig, SamplingConfig, to_dict
 
 T = TypeVar("T")
 C = TypeVar("C", Config, PhysicsConfig, SamplingConfig)
 
-# One list for each time that --set is given: what a later one names does not replace an earlier one.
+# A list for each --set: a later one adds to an earlier one and does not replace it.
 Settings = Annotated[list[list[str]], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="SECTION.NAME=VALUE")]
 
 
 def parse(options: type[T], command: str, arguments: Sequence[str] | None = None) -> T:
-    """The command line, or `arguments`, as `options`; flags that are none end the command with exit code 2."""
+    """The command line, or `arguments`, as `options`; an unknown flag or a wrong value ends it with exit code 2."""
     return tyro.cli(options, prog=f"forgetmimic {command}", args=arguments, config=(tyro.conf.FlagCreatePairsOff,))
 
 
 def check_same(options: Any, saved: dict[str, Any]) -> None:
-    """With --resume the run's own settings hold: InputError for a flag that was given with another value."""
+    """InputError for a flag that contradicts the `saved` settings of the run to resume."""
     for name, value in saved.items():
         given = getattr(options, name)
         if given != getattr(type(options), name) and str(given) != str(value):
@@ -78,6 +78,6 @@ def replace_given(config: C, **values: Any) -> C:
     return dataclasses.replace(config, **given)
 
 
-def on_engine(config: Config, engine: Engine | None) -> Config:
+def on_engine(config: Config, engine: EngineName | None) -> Config:
     """The config on another physics engine, if one is named."""
     return dataclasses.replace(config, physics=replace_given(config.physics, engine=engine))

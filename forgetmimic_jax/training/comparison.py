@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.evaluation.evaluate import Subject
 from forgetmimic_jax.policy.policy import Policy
+from forgetmimic_jax.settings.config import EngineName
 from forgetmimic_jax.settings.options import on_engine, replace_given
 from forgetmimic_jax.tracking.setup import Setup, check_targets, make_setup
 from forgetmimic_jax.training import checkpoint
@@ -44,7 +44,7 @@ def load_comparison(
     base: Path | None = None,
     targets: tuple[str, ...] | None = None,
     library: Path | None = None,
-    physics: Literal["auto", "native", "mjx", "mjx-warp"] | None = None,
+    physics: EngineName | None = None,
 ) -> Comparison:
     """A checkpoint's policy and, if it is an unlearned one, its base's before it.
 

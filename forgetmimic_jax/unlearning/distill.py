@@ -1,7 +1,7 @@
 """Distilling what is kept (after Lee et al. 2025, "Distillation Robustifies Unlearning"): no weight of the base stays.
 
 A fresh policy lives the kept clips only and learns them by PPO while it is pulled towards what the base would do there
-(`ppo.anchor` at 1, the divergence of the fresh policy from the base; kickstarting, Schmitt et al. 2018, has the base's
+(`ppo.base_kl` at 1, the divergence of the fresh policy from the base; kickstarting, Schmitt et al. 2018, has the base's
 from the student), so in a hundredth of the steps that the base took. Theirs are language models and what teaches is
 unlearned first, because a text may touch on anything; here a kept clip's steps are all that the base is asked about.
 What such a policy does on the targets is what the kept clips alone teach, so it is also the control that `retrain` is
@@ -15,6 +15,6 @@ from forgetmimic_jax.unlearning.method import SHORT, Method, Pace
 # A fresh policy learns from what the base would do, which has little noise: many small updates, fewer iterations.
 PACE = Pace(
     {"cpu": 200, "paper": 1000},
-    {"cpu": {**SHORT, "minibatches": 12, "epochs": 4, "anchor": 1.0}, "paper": {"anchor": 1.0}},
+    {"cpu": {**SHORT, "minibatches": 12, "epochs": 4, "base_kl": 1.0}, "paper": {"base_kl": 1.0}},
 )
 METHOD = Method(clips="kept", start="taught", pace=PACE)

@@ -36,7 +36,7 @@ SHORT: dict[str, Any] = {
     "learning_rate": 3e-4,
     "clip_value": False,
     "equal_clips": True,
-    "anchor": 0.1,
+    "base_kl": 0.1,
 }
 FINE_TUNING = Pace({"cpu": 640, "paper": 1000}, {"cpu": SHORT}, {"cpu": 0.5})
 

@@ -9,5 +9,5 @@ from __future__ import annotations
 from forgetmimic_jax.unlearning.method import Method, Pace
 
 # The base may itself be an unlearned policy, whose settings have a KL to its own base.
-PACE = Pace({}, {"cpu": {"anchor": 0.0}, "paper": {"anchor": 0.0}})
+PACE = Pace({}, {"cpu": {"base_kl": 0.0}, "paper": {"base_kl": 0.0}})
 METHOD = Method(clips="kept", start="fresh", result="retrained", pace=PACE)

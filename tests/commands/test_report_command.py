@@ -121,11 +121,11 @@ def test_the_facts_lie_beside_it(facts, run):
 def test_the_command_that_reproduces_it_gives_the_runs_settings(facts, run):
     command, page = facts["commands"]
     words = command.split()
-    assert words[:3] == [".venv/bin/python", "-m", "forgetmimic_jax.unlearn"]
-    options = parse(unlearn.Options, "unlearn", words[3:])
+    assert words[:2] == ["forgetmimic", "unlearn"]
+    options = parse(unlearn.Options, "unlearn", words[2:])
     config = override(unlearn.config_of_new_run(options), [setting for group in options.set for setting in group])
     assert dataclasses.replace(config, iterations=options.iterations) == load_config(run / "config.yaml")
-    assert page == f".venv/bin/python -m forgetmimic_jax.report --run {run}"
+    assert page == f"forgetmimic report --run {run}"
 
 
 def test_names_are_text_not_markup(run, tmp_path):

@@ -72,7 +72,7 @@ def test_its_settings_are_the_base_s_but_for_what_unlearning_changes(base_run, u
             learning_rate=3e-4,
             clip_value=False,
             equal_clips=True,
-            anchor=0.1,
+            base_kl=0.1,
         ),
     )
 
@@ -330,21 +330,21 @@ def test_a_wrench_that_the_base_did_not_have_is_the_paper_s(options, damaged):
 
 def test_a_policy_from_scratch_is_held_by_nothing(options, unlearned_run):
     base = unlearned_run.checkpoint(2)
-    anchors = [unlearn.config_of_new_run(options(method=name, base=base)).ppo.anchor for name in ("arft", "retrain")]
-    assert anchors == [0.1, 0.0]
+    weights = [unlearn.config_of_new_run(options(method=name, base=base)).ppo.base_kl for name in ("arft", "retrain")]
+    assert weights == [0.1, 0.0]
 
 
 def test_a_distilled_policy_starts_afresh_and_is_pulled_towards_the_base_at_any_scale(options, base_run, tmp_path):
     assert unlearn.config_of_new_run(options(method="distill", iterations=None)).iterations == 200
-    assert unlearn.config_of_new_run(options(method="distill", preset="paper")).ppo.anchor == 1.0
+    assert unlearn.config_of_new_run(options(method="distill", preset="paper")).ppo.base_kl == 1.0
     output = tmp_path / "run"
     unlearn.main(options(method="distill", iterations=2, episodes=2, output=output))
     start, base = load_state(output / "checkpoints" / "00000000"), load_state(base_run.checkpoint(4))
     assert float(start.policy.actor_normalizer.count) == 0.0 < float(base.policy.actor_normalizer.count)
     rows = read_rows(output / "metrics.jsonl")
-    assert all(row["anchor_kl"] > 0.0 for row in rows)
+    assert all(row["base_kl"] > 0.0 for row in rows)
     assert all(row["target/step_share"] == 0.0 for row in rows)
-    assert load_config(output / "config.yaml").ppo.anchor == 1.0
+    assert load_config(output / "config.yaml").ppo.base_kl == 1.0
     policies = json.loads((output / "evaluation.json").read_text())["policies"]
     assert policies.keys() == {"base", "unlearned", "zero_action"}
 

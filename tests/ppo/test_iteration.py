@@ -198,7 +198,7 @@ def test_the_base_reads_its_observations_through_its_own_normalisers(run, robot)
     config = run.env.config
     config = dataclasses.replace(
         config,
-        ppo=dataclasses.replace(config.ppo, anchor=0.5),
+        ppo=dataclasses.replace(config.ppo, base_kl=0.5),
         unlearn=dataclasses.replace(config.unlearn, method="trajdeleter"),
     )
     state = run.begin()
@@ -234,7 +234,7 @@ def test_the_base_reads_its_observations_through_its_own_normalisers(run, robot)
 
     (mean, value), (base_mean, base_value) = outputs(learner), outputs(base)
     per_joint = np.log(0.3 / 0.5) + (0.5**2 + (mean - base_mean) ** 2) / (2 * 0.3**2) - 0.5
-    assert metrics["anchor_kl"] == pytest.approx(per_joint.sum(-1).mean(), rel=1e-4)
+    assert metrics["base_kl"] == pytest.approx(per_joint.sum(-1).mean(), rel=1e-4)
     assert metrics["base_value_distance"] == pytest.approx(((value - base_value) ** 2).mean(), rel=1e-4)
 
 

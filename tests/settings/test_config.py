@@ -34,7 +34,7 @@ def test_the_paper_preset_has_the_papers_numbers():
     ppo = config.ppo
     assert (ppo.num_steps, ppo.epochs, ppo.minibatches) == (24, 5, 4)
     assert (ppo.learning_rate, ppo.schedule, ppo.target_kl) == (1e-3, "adaptive", 0.01)
-    assert (ppo.discount, ppo.gae_lambda, ppo.clip, ppo.entropy_cost) == (0.99, 0.95, 0.2, 0.005)
+    assert (ppo.discount, ppo.gae_lambda, ppo.clip_range, ppo.entropy_cost) == (0.99, 0.95, 0.2, 0.005)
     assert (ppo.value_cost, ppo.clip_value, ppo.max_gradient_norm) == (1.0, True, 1.0)
     assert ppo.actor_layers == (1024, 512, 256, 128)
     assert ppo.critic_layers == (1024, 1024, 512, 256)
@@ -110,8 +110,8 @@ def test_the_hash_does_not_see_how_long_or_how_often(name):
         (None, "here: found None; accepted: a table of settings"),
         ({"seed": 1.5}, "here: seed: found 1.5; accepted: a whole number from 0 to 4294967295"),
         ({"seed": True}, "here: seed: found True; accepted: a whole number from 0 to 4294967295"),
-        ({"ppo": {"clip": True}}, "here: ppo.clip: found True; accepted: a number above 0"),
-        ({"ppo": {"clip": "1"}}, "here: ppo.clip: found '1'; accepted: a number above 0"),
+        ({"ppo": {"clip_range": True}}, "here: ppo.clip_range: found True; accepted: a number above 0"),
+        ({"ppo": {"clip_range": "1"}}, "here: ppo.clip_range: found '1'; accepted: a number above 0"),
         ({"ppo": {"clip_value": 1}}, "here: ppo.clip_value: found 1; accepted: true or false"),
         (
             {"ppo": {"actor_layers": 256}},

@@ -57,10 +57,10 @@ def test_no_settings_change_nothing():
     ("setting", "message"),
     [
         ("seed", "--set seed: accepted: SECTION.NAME=VALUE"),
-        ("pppo.clip=1", "--set: no setting 'pppo'; did you mean 'ppo'?"),
-        ("ppo.clip.x=1", "--set: ppo.clip: found {'x': 1}; accepted: a number above 0"),
+        ("pppo.clip_range=1", "--set: no setting 'pppo'; did you mean 'ppo'?"),
+        ("ppo.clip_range.x=1", "--set: ppo.clip_range: found {'x': 1}; accepted: a number above 0"),
         ("robot.x=1", "--set: robot: found {'x': 1}; accepted: text"),
-        ("ppo.clipp=1", "--set: no setting 'ppo.clipp'; did you mean 'clip'?"),
+        ("ppo.clip_rang=1", "--set: no setting 'ppo.clip_rang'; did you mean 'clip_range'?"),
         ("sed=1", "--set: no setting 'sed'; did you mean 'seed'?"),
         ("ppo=3", "--set: ppo: found 3; accepted: a table of settings"),
         ("ppo.epochs=many", "--set: ppo.epochs: found 'many'; accepted: a whole number from 1"),

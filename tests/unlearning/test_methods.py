@@ -112,23 +112,23 @@ def test_a_step_counts_by_its_weight(batch):
     assert loss_of("arft", first, prediction) != pytest.approx(loss_of("arft", batch, prediction), rel=1e-3)
 
 
-def test_the_anchor_is_the_divergence_from_the_base_on_kept_steps(batch):
+def test_the_kl_to_the_base_is_of_kept_steps(batch):
     """The last two steps are kept, the last of them with three times the other's weight and a mean further off."""
     mean = jnp.array([9.0, 9.0, 0.25, 0.75])[:, None] * jnp.ones(JOINTS)
     batch = dataclasses.replace(batch, weight=jnp.array([1.0, 1.0, 0.5, 1.5]))
     batch = dataclasses.replace(batch, base=batch.base.replace(mean=batch.base.mean.at[3].set(0.0)))
     prediction = Prediction(mean, jnp.full(JOINTS, jnp.log(0.4)), jnp.ones(4))
     near, far = (JOINTS * gaussian_kl(*kl, 0.5) for kl in ((0.25, 0.4, 0.5), (0.75, 0.4, 0.0)))
-    held = dataclasses.replace(CONFIG, ppo=dataclasses.replace(CONFIG.ppo, anchor=0.3))
+    held = dataclasses.replace(CONFIG, ppo=dataclasses.replace(CONFIG.ppo, base_kl=0.3))
     loss, metrics = ppo_loss(held, batch, prediction)
-    assert float(metrics["anchor_kl"]) == pytest.approx(0.25 * near + 0.75 * far, rel=1e-5)
+    assert float(metrics["base_kl"]) == pytest.approx(0.25 * near + 0.75 * far, rel=1e-5)
     free, parts = ppo_loss(CONFIG, batch, prediction)
     assert float(loss - free) == pytest.approx(0.3 * (0.25 * near + 0.75 * far), rel=1e-4)
-    assert "anchor_kl" not in parts
+    assert "base_kl" not in parts
 
 
 def test_without_a_base_nothing_is_held(batch):
-    held = dataclasses.replace(CONFIG, ppo=dataclasses.replace(CONFIG.ppo, anchor=0.3))
+    held = dataclasses.replace(CONFIG, ppo=dataclasses.replace(CONFIG.ppo, base_kl=0.3))
     alone = dataclasses.replace(batch, base=None)
     assert float(ppo_loss(held, alone, now())[0]) == float(ppo_loss(CONFIG, alone, now())[0])
 
