@@ -6,6 +6,8 @@ import difflib
 import sys
 from collections.abc import Callable, Iterable
 
+from forgetmimic_jax.basics.signals import second_signal_ends
+
 
 class InputError(Exception):
     """Bad input: the message names the file, the field, what was found and what is accepted."""
@@ -25,10 +27,12 @@ def nearest(name: str, known: Iterable[str]) -> str:
 def run_command(command: Callable[[], None]) -> None:
     """Run a command's body; bad input, a full disk and Ctrl-C end it with one line.
 
-    Exit codes: 2 for bad input or an operating system's refusal, 130 for Ctrl-C.
+    Exit codes: 2 for bad input or an operating system's refusal, 130 for Ctrl-C. A second Ctrl-C or SIGTERM waits for
+    nothing.
     """
     try:
-        command()
+        with second_signal_ends():
+            command()
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)

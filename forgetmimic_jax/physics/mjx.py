@@ -135,11 +135,16 @@ def _step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
     A motor at its torque limit does not answer to velocity, so C and Warp leave its damping out of the implicit
     integration; `mjx.step` keeps it, which slows a saturated joint by rad/s within a control step.
+
+    On a CPU, LAPACK's part of the step comes in one order: the integrator's factorisation needs the solver's result.
+    jaxlib's batched LAPACK calls hold a thread of XLA's pool while they wait for the other threads to do the work. Two
+    calls at once hold both threads of two cores, and wait forever.
     """
     data = mjx.forward(model, data)
     lower, upper = model.actuator_forcerange.T
     saturated = model.actuator_forcelimited & ((data.actuator_force <= lower) | (data.actuator_force >= upper))
     damping = jnp.where(saturated, 0.0, model.actuator_biasprm[:, 2])
+    damping = jnp.where(jnp.isfinite(data.qacc).all(), damping, jnp.nan)  # the order above; diverged stays diverged
     return mjx.implicit(model.tree_replace({"actuator_biasprm": model.actuator_biasprm.at[:, 2].set(damping)}), data)
 
 

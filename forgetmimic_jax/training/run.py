@@ -13,6 +13,7 @@ from rich.console import Console
 from forgetmimic_jax.basics.console import command_line
 from forgetmimic_jax.basics.console import progress as progress_bar
 from forgetmimic_jax.basics.errors import Interrupted
+from forgetmimic_jax.basics.signals import stop_requests
 from forgetmimic_jax.ppo.state import TrainState
 from forgetmimic_jax.ppo.update import make_iteration
 from forgetmimic_jax.settings.config import Config, save_config
@@ -22,7 +23,6 @@ from forgetmimic_jax.training import checkpoint
 from forgetmimic_jax.training.checkpoint import Progress, checkpoints, newest_checkpoint
 from forgetmimic_jax.training.folder import BEST, prepare_folder
 from forgetmimic_jax.training.log import Log
-from forgetmimic_jax.training.signals import stop_requests
 from forgetmimic_jax.training.start import base_checkpoint, saved_state, start_state, steps_before
 from forgetmimic_jax.training.watch import Watch
 from forgetmimic_jax.unlearning.registry import method_of

@@ -241,17 +241,6 @@ def test_a_stop_in_the_last_iteration_is_still_a_stop(run):
         run(iterations=3)
 
 
-def test_a_second_stop_does_not_wait(run):
-    def twice():
-        os.kill(os.getpid(), signal.SIGINT)
-        os.kill(os.getpid(), signal.SIGINT)
-
-    run.before[20] = twice
-    with pytest.raises(Interrupted, match=r"saved .*/00000015; continue with"):
-        run()
-    assert names(run.folder) == ["00000000", "00000015"]
-
-
 @contextlib.contextmanager
 def full_disk(at: int) -> Iterator[None]:
     """The system refuses to save iteration `at`."""
