@@ -11,6 +11,7 @@ What a search finds, the robot can do. Where it finds nothing, the clip may be i
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -36,12 +37,13 @@ class SearchConfig:
     after: int = 30  # steps to survive after them
     knot: int = 4  # steps between two knots
     rounds: int = 45  # without reset noise
-    noisy_rounds: int = 30  # with it
+    noisy_rounds: int = 30  # with it; it grows to its full size over the first half of them
     elites: float = 0.125  # share of the rollouts that the next round is drawn around
     noisy_elites: float = 0.25  # luck counts for less among more of them
     starting_std: float = 1.5  # far beyond exploration noise: the way may be far from the policy
     least_std: float = 0.15
     keep: float = 0.3  # share of the last round's mean and standard deviation
+    seed: int = 0  # of the draws and of the reset noise
 
 
 @dataclass(frozen=True)
@@ -68,14 +70,20 @@ def first_failures(env: Environment, assets: Assets, policy: Policy) -> np.ndarr
     if env.num_envs < clips:
         raise ValueError(f"{env.num_envs} robots for {clips} clips; one a clip is needed")
     steps = min(env.config.max_episode_steps, int(assets.library.length.max()) - 1)
-    state = _start(env, assets, clip, 0, None)
+    state = _start(env, assets, clip, 0, 0.0, jax.random.PRNGKey(0))
     nothing = jnp.zeros((steps, 1, env.robot.num_joints))
     survived = np.asarray(jax.jit(partial(_roll, env))(assets, policy, state, nothing)[0]).astype(int)
     return np.where(survived < np.asarray(state.horizon), survived, -1)[:clips]
 
 
 def search(
-    env: Environment, assets: Assets, policy: Policy, clip: int, failure: int, config: SearchConfig, seed: int = 0
+    env: Environment,
+    assets: Assets,
+    policy: Policy,
+    clip: int,
+    failure: int,
+    config: SearchConfig,
+    report: Callable[[int, Mapping[str, float]], None] = lambda done, metrics: None,
 ) -> Found:
     """Actions that pass frame `failure` of a clip, where the policy fails.
 
@@ -86,7 +94,7 @@ def search(
         clip: index of the clip.
         failure: frame at which the policy fails; see `first_failures`.
         config: size of the search.
-        seed: of the draws and of the reset noise.
+        report: called after every round with the rounds done and what they gave.
 
     Raises:
         ValueError: the clip ends before a step can be searched.
@@ -98,34 +106,38 @@ def search(
     if not 0 <= failure <= start + left or window < 2:
         raise ValueError(f"failure at frame {failure}, in a clip of {start + left + 1} frames: nothing to search")
     lines = straight_lines(max(2, window // config.knot), window)
-    roll, rng = jax.jit(partial(_roll, env), static_argnames="record"), np.random.default_rng(seed)
+    roll, rng = jax.jit(partial(_roll, env), static_argnames="record"), np.random.default_rng(config.seed)
 
-    def rollouts(knots: np.ndarray, key: Array | None, record: bool = False) -> Any:
-        """`_roll` with knots [rollout, knot, joint]; with reset noise where there is a key."""
+    def rollouts(knots: np.ndarray, noise: float, key: Array, record: bool = False) -> Any:
+        """`_roll` with knots [rollout, knot, joint] and `noise` times the reset noise."""
         added = np.zeros((steps, *knots.shape[::2]), np.float32)
         added[:window] = np.einsum("sk,rkj->srj", lines, knots)
-        return jax.device_get(roll(assets, policy, _start(env, assets, clip, start, key), added, record=record))
+        return jax.device_get(roll(assets, policy, _start(env, assets, clip, start, noise, key), added, record=record))
 
     mean = np.zeros((1, lines.shape[1], env.robot.num_joints))
     std = np.full_like(mean, config.starting_std)
-    keys = jax.random.split(jax.random.PRNGKey(seed), 1 + config.noisy_rounds)
-    policy_survived = int(rollouts(mean, None)[0][0])
-    for number in range(config.rounds + config.noisy_rounds):
+    keys = jax.random.split(jax.random.PRNGKey(config.seed), config.rounds + config.noisy_rounds + 1)
+    policy_survived = int(rollouts(mean, 0.0, keys[0])[0][0])
+    for number, key in enumerate(keys[:-1]):
         noisy = number >= config.rounds
+        noise = min(1.0, 2.0 * (number + 1 - config.rounds) / config.noisy_rounds) if noisy else 0.0
         knots = mean + std * rng.standard_normal((env.num_envs, *mean.shape[1:]))
-        survived, tracked, _ = rollouts(knots, keys[number - config.rounds] if noisy else None)
+        if not noisy:
+            knots[:1] = mean
+        survived, tracked, _ = rollouts(knots, noise, key)
         elites = max(2, round((config.noisy_elites if noisy else config.elites) * env.num_envs))
         best = knots[np.argsort(-(survived / steps + tracked), kind="stable")[:elites]]
         mean = config.keep * mean + (1.0 - config.keep) * best.mean(0)
         std = np.maximum(config.keep * std + (1.0 - config.keep) * best.std(0), config.least_std)
-    passed, _, lessons = rollouts(mean, keys[-1], record=True)
+        report(number + 1, {"passed": float((survived == steps).mean()), "reset_noise": noise})
+    passed, _, lessons = rollouts(mean, 1.0, keys[-1], record=True)
     passed = passed == steps
     return Found(
         start=start,
         steps=steps,
         added=(lines @ mean[0]).astype(np.float32),
         policy_survived=policy_survived,
-        survived=int(rollouts(mean, None)[0][0]),
+        survived=int(rollouts(mean, 0.0, keys[0])[0][0]),
         passed=float(passed.mean()),
         lessons=jax.tree.map(lambda x: x[:, passed].reshape(-1, *x.shape[2:]), lessons),
     )
@@ -137,16 +149,11 @@ def straight_lines(knots: int, steps: int) -> np.ndarray:
     return np.stack([np.interp(places, np.arange(knots), one) for one in np.eye(knots)], axis=-1)
 
 
-def _start(env: Environment, assets: Assets, clip: int | np.ndarray, frame: int, key: Array | None) -> EnvState:
-    """Every robot at a frame of a clip; exactly on the reference where there is no key for the reset noise."""
-    if key is None:
-        none = {
-            field.name: jax.tree.map(lambda _: 0.0, getattr(env.config.noise, field.name))
-            for field in dataclasses.fields(env.config.noise)
-            if field.name.startswith("reset_")
-        }
-        quiet = dataclasses.replace(env.config, noise=dataclasses.replace(env.config.noise, **none))
-        env, key = dataclasses.replace(env, config=quiet), jax.random.PRNGKey(0)
+def _start(env: Environment, assets: Assets, clip: int | np.ndarray, frame: int, noise: float, key: Array) -> EnvState:
+    """Every robot at a frame of a clip, with `noise` times the config's reset noise."""
+    widths = {name: value for name, value in dataclasses.asdict(env.config.noise).items() if name.startswith("reset_")}
+    scaled = dataclasses.replace(env.config.noise, **jax.tree.map(lambda width: noise * width, widths))
+    env = dataclasses.replace(env, config=dataclasses.replace(env.config, noise=scaled))
     zeros = jnp.zeros((env.num_envs,), jnp.int32)
     state = tracking.start_episodes(env, assets, key, zeros + clip, zeros, zeros + frame, zeros.astype(jnp.float32))
     return tracking.refresh_bodies(env, state, zeros == 0)

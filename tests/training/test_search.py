@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from forgetmimic_jax.policy.policy import init_policy
 from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.tracking.reference import lookup
 from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.training.search import SearchConfig, first_failures, search, straight_lines
+from forgetmimic_jax.training.start import fresh_policy
 
 ROLLOUTS, JOINTS, SWAY, TURN = 32, 29, 0, 1
 CONFIG = SearchConfig(before=10, window=12, after=4, rounds=8, noisy_rounds=6, starting_std=0.5)
@@ -35,8 +35,8 @@ def assets(setup):
 
 
 @pytest.fixture(scope="module")
-def policy(env):
-    return init_policy(env.config.ppo, JOINTS, 132, 623, jax.random.PRNGKey(0))
+def policy(setup, assets):
+    return fresh_policy(setup, assets)
 
 
 @pytest.fixture(scope="module")
@@ -51,12 +51,12 @@ def survived(env, assets, policy):
             env, assets, jax.random.PRNGKey(0), clips, 0 * clips, frames, jnp.zeros(ROLLOUTS)
         )
         reference, root = lookup(assets.library, clips, frames), env.robot.root
-        quat = np.asarray(reference.body_quat[:, root])
-        spin = Rotation.from_quat(quat, scalar_first=True).inv().apply(np.asarray(reference.body_ang_vel[:, root]))
+        quat = np.asarray(reference.bodies.quat[:, root])
+        spin = Rotation.from_quat(quat, scalar_first=True).inv().apply(np.asarray(reference.bodies.ang_vel[:, root]))
         physics = dataclasses.replace(
             state.physics,
-            qpos=jnp.concatenate([reference.body_pos[:, root], quat, reference.joint_pos], axis=-1),
-            qvel=jnp.concatenate([reference.body_lin_vel[:, root], jnp.float32(spin), reference.joint_vel], axis=-1),
+            qpos=jnp.concatenate([reference.bodies.pos[:, root], quat, reference.joint_pos], axis=-1),
+            qvel=jnp.concatenate([reference.bodies.lin_vel[:, root], jnp.float32(spin), reference.joint_vel], axis=-1),
         )
         state = dataclasses.replace(state, physics=physics)
         for number, more in enumerate(added):
