@@ -173,7 +173,10 @@ def _summary(document: EvaluationDocument) -> str:
 
 
 def _code(document: EvaluationDocument) -> str:
-    return f" Code: commit {document.made.commit[:7]}." if document.made else ""
+    if document.made is None:
+        return ""
+    commit, changes, what = document.made.commit.partition("+")  # a commit is marked where the code was changed since
+    return f" Code: commit {commit[:7]}{changes}{what}."
 
 
 def _error_rows(document: EvaluationDocument) -> Rows:

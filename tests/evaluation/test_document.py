@@ -20,7 +20,7 @@ from forgetmimic_jax.evaluation.document import (
 )
 from forgetmimic_jax.evaluation.plots import clip_bars, training_curves
 from forgetmimic_jax.evaluation.summary import evaluate_policies
-from forgetmimic_jax.evaluation.tables import fill, markdown, markdown_tables, render_table
+from forgetmimic_jax.evaluation.tables import fill, markdown, render_table
 
 NAMES = ["walk", "punch", "unused", "crawl"]
 
@@ -49,7 +49,9 @@ def document(rollouts):
         targets=["punch"],
         policies=evaluate_policies(rollouts, NAMES, ["punch"], seed=0),
         budget={"unlearned": {"iterations": 40, "environment_steps": 123456}},
-        made=Provenance(**{name: "x" for name in Provenance.__dataclass_fields__} | {"cores": 2}),
+        made=Provenance(
+            **dict.fromkeys(Provenance.__dataclass_fields__, "x") | {"cores": 2, "commit": "c0ffee123+changes"}
+        ),
         policy_hashes={"base": "b", "unlearned": "u"},
     )
 
@@ -227,7 +229,13 @@ def test_readme_blocks_are_filled_from_the_file_they_name(tmp_path, document):
     block = "a\n<!-- evaluation:start results/evaluation.json -->\nold\n<!-- evaluation:end -->\nb\n"
     filled = fill(block, tmp_path)
     assert "old" not in filled
-    assert markdown_tables(document) in filled
+    assert "Trained for: unlearned 123,456 environment steps, 40 iterations. Code: commit c0ffee1+changes." in filled
+    # punch is the one target; walk and crawl are kept.
+    assert "| target success | 50 % [1, 99] | 0 % [0, 84] | 0 % [0, 84] |" in filled
+    assert [line.split(" | ")[0] for line in filled.splitlines() if line.startswith("| ")] == [
+        *("| ", "| ---", "| target success", "| target tracking", "| target skill"),
+        *("| kept success", "| kept tracking", "| kept skill"),
+    ]
     assert fill(filled, tmp_path) == filled
     with pytest.raises(InputError, match=r"no file none\.json"):
         fill(block.replace("results/evaluation.json", "none.json"), tmp_path)
