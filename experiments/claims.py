@@ -11,7 +11,6 @@ import itertools
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +26,9 @@ from forgetmimic_jax.evaluation.relearning import at_first, lasted
 from forgetmimic_jax.evaluation.statistics import Estimate
 from forgetmimic_jax.evaluation.tables import FORGOTTEN, markdown_table, number, percent
 from forgetmimic_jax.evaluation.variants import DEVIATION, within
+from forgetmimic_jax.studies.claim import Finding, finding_between, judged
 from forgetmimic_jax.studies.study import RESULTS
-from forgetmimic_jax.sweep import edge, half_gone_by_seed
+from forgetmimic_jax.sweep import half_gone_by_seed, told_half_gone
 
 README = Path(__file__).parent / "README.md"
 BLOCK = re.compile(r"(<!-- claims:start -->\n).*?(<!-- claims:end -->)", re.DOTALL)
@@ -46,27 +46,6 @@ UNIFORM, FROZEN, ADAPTIVE = "arft, uniform clips", "arft, frozen", "arft, adapti
 SAMPLERS = (UNIFORM, "arft, uniform bins", FROZEN, ADAPTIVE)
 BASELINES = tuple(f"{name.replace('_', ' ')}, plain PPO" for name in comparison.PAPERS)
 INCOMPLETE = ("random reward, plain PPO", "trajdeleter, plain PPO")  # which the paper says forget less
-
-
-@dataclass(frozen=True)
-class Finding:
-    """What a study says of a claim: a row of the table."""
-
-    claim: str
-    verdict: str
-    evidence: str
-    seeds: int
-
-
-def judged(value: Estimate, bound: float, *, below: bool = True) -> str:
-    """Whether a number lies below (or above) its bound."""
-    mean = value["mean"]
-    if "low" not in value:
-        return "one seed: yes" if (mean <= bound) == below else "one seed: no"
-    low, high = value["low"], value["high"]
-    if (high <= bound) if below else (low >= bound):
-        return "holds"
-    return "does not hold" if ((low > bound) if below else (high < bound)) else "open"
 
 
 def gained(variants: Mapping[str, Any], label: str, other: str | None, group: str, metric: str) -> Estimate | None:
@@ -174,16 +153,12 @@ def of_comparison(document: Mapping[str, Any]) -> Iterator[Finding]:
 def of_penalty(document: Mapping[str, Any]) -> Iterator[Finding]:
     """Table 2: where the targets tip over."""
     variants = document["results"]["variants"]
-    crossed, seeds = half_gone_by_seed(variants)
+    crossed = half_gone_by_seed(variants)
     if crossed:
-        found = statistics.over_seeds(crossed)
         crit = next(iter(variants.values()))["over_seeds"].get("lambda_crit")
-        evidence = f"half of the skill is gone at λ = {number(found, 1)}; λ_crit on the base's steps {number(crit, 2)}"
-        verdict = judged(found, edge())
-        if len(crossed) < seeds:  # the others need more than was tried
-            evidence += f"; in {len(crossed)} of {seeds} seeds, in the others at none that was tried"
-            verdict = "open" if verdict == "holds" else verdict
-        yield Finding(f"forgetting sets in below λ = {edge():g} = W", verdict, evidence, found["n"])
+        evidence = f"half of the skill is gone at λ = {told_half_gone(crossed)}"
+        evidence += f"; λ_crit on the base's steps {number(crit, 2)}" if crit else ""
+        yield finding_between("forgetting sets in below λ = 8 = W", crossed, 8.0, evidence)
 
 
 def of_heat_map(document: Mapping[str, Any]) -> Iterator[Finding]:
@@ -337,7 +312,7 @@ def table(folder: Path = RESULTS, judges: Mapping[str, Callable] = JUDGES) -> st
             continue
         document = json.loads(path.read_text())
         rows += [
-            [f"[{Path(study).name}](results/{study}.md)", of.claim, f"**{of.verdict}**", of.evidence, str(of.seeds)]
+            [f"[{Path(study).name}](results/{study}.md)", of.claim, f"**{of.word}**", of.evidence, str(of.seeds)]
             for of in judge(document)
         ]
     text = markdown_table(["study", "claim", "here", "evidence", "seeds"], rows) if rows else ""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -18,6 +18,7 @@ from forgetmimic_jax.evaluation.plots import curve, heat_map, new_figure
 from forgetmimic_jax.evaluation.tables import FORGOTTEN, number
 from forgetmimic_jax.evaluation.variants import variant_table
 from forgetmimic_jax.settings.options import comma_separated, parse
+from forgetmimic_jax.studies.claim import Between
 from forgetmimic_jax.studies.study import ITERATIONS, Lab, Study, conduct, variants_study
 from forgetmimic_jax.studies.study import Options as StudyOptions
 
@@ -143,12 +144,11 @@ def _tell_lambda(variants: Mapping[str, Any]) -> str:
             "On the base's own target steps the mean reward changes its sign at λ_crit = W (1 + R_reg / R_track) = "
             f"{number(first['lambda_crit'], 2)}; W = {edge():g} leaves the other rewards out.\n"
         )
-    crossed, seeds = half_gone_by_seed(variants)
+    crossed = half_gone_by_seed(variants)
     if crossed:
         lines.append(
-            f"Half of the base's skill on the targets is gone at λ = {number(statistics.over_seeds(crossed), 2)} "
-            f"(mean of the {len(crossed)} of {seeds} seeds in which it went; between two penalties, on a straight line "
-            "in log λ). That is how far this budget gets: a longer run may tip over earlier.\n"
+            f"Half of the base's skill on the targets is gone at λ = {told_half_gone(crossed)} (between two penalties "
+            "the skill is taken as linear in log λ). A longer run may forget at a smaller λ.\n"
         )
     lines.append(
         f"At most {100 * FORGOTTEN:.0f} % of the base's skill on the targets is left at "
@@ -157,24 +157,40 @@ def _tell_lambda(variants: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def half_gone_by_seed(variants: Mapping[str, Any]) -> tuple[list[float], int]:
-    """The penalty at which half of the skill is gone, for each seed that got there, and of how many seeds."""
+def half_gone_by_seed(variants: Mapping[str, Any]) -> list[Between]:
+    """Where half of the skill is gone, for each seed that has a skill."""
     skills: dict[str, dict[float, float]] = {}
     for variant in variants.values():
         for seed, run in variant["seeds"].items():
             if "skill" in run["policy"]["target"]:
                 skills.setdefault(seed, {})[float(variant["options"]["penalty"])] = run["policy"]["target"]["skill"]
-    return [penalty for penalty in map(half_gone, skills.values()) if penalty], len(skills)
+    return [half_gone(of) for of in skills.values()]
 
 
-def half_gone(skills: Mapping[float, float]) -> float | None:
-    """The penalty at which the skill, linear in log λ between the penalties tried, first falls to a half."""
+def half_gone(skills: Mapping[float, float]) -> Between:
+    """The penalty at which the skill, linear in log λ between the penalties tried, first falls to a half.
+
+    Between 0 and the smallest penalty where the skill is at most a half there already, between the largest and infinity
+    where it is more than a half at all of them.
+    """
     tried = sorted(skills)
+    if skills[tried[0]] <= 0.5:
+        return Between(0.0, tried[0])
     for low, high in itertools.pairwise(tried):
         if skills[low] > 0.5 >= skills[high]:
             share = (skills[low] - 0.5) / (skills[low] - skills[high])
-            return low * (high / low) ** share
-    return None
+            return Between(*[low * (high / low) ** share] * 2)
+    return Between(tried[-1], math.inf)
+
+
+def told_half_gone(crossed: Sequence[Between]) -> str:
+    """The mean over the seeds; seed by seed where one lies outside the penalties that were tried."""
+    if all(low == high for low, high in crossed):
+        return f"{number(statistics.over_seeds([low for low, _ in crossed]), 1)}, mean of {len(crossed)} seed(s)"
+    words = [
+        f"{low:.1f}" if low == high else f"below {high:g}" if low == 0.0 else f"above {low:g}" for low, high in crossed
+    ]
+    return f"{', '.join(words)}, seed by seed"
 
 
 def _draw_lambda(variants: Mapping[str, Any]) -> Figure:

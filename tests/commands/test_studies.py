@@ -326,8 +326,3 @@ def test_the_comparison_asks_for_every_method_and_every_sampler_with_and_without
     assert {key[4] for key in asked_for if key[0] == "finetune"} == {None, "all"}
     assert [given.iterations for key, given in asked_for.items() if key[0] == "retrain"] == [7]  # once, on a laptop
     assert {key[5] for key in asked_for if key[0] != "retrain"} == {0, 1}
-
-
-def test_the_penalty_where_half_of_the_skill_is_gone_lies_between_two_that_were_tried():
-    assert sweep.half_gone({16.0: 0.1, 4.0: 0.9, 8.0: 0.7}) == pytest.approx(8.0 * 2.0 ** (0.2 / 0.6))
-    assert sweep.half_gone({4.0: 0.9, 16.0: 0.6}) is None

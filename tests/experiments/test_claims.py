@@ -1,10 +1,13 @@
 import json
+import math
 
 import pytest
 
 from experiments import claims
+from forgetmimic_jax import sweep
 from forgetmimic_jax.evaluation import variants
 from forgetmimic_jax.evaluation.statistics import over_seeds
+from forgetmimic_jax.studies.claim import judged
 
 
 @pytest.mark.parametrize(
@@ -20,7 +23,7 @@ from forgetmimic_jax.evaluation.statistics import over_seeds
     ],
 )
 def test_a_claim_holds_where_the_whole_interval_does(values, below, verdict):
-    assert claims.judged(over_seeds(values), 0.05, below=below) == verdict
+    assert judged(over_seeds(values), 0.05, below=below) == verdict
 
 
 def variant(target: list[float], kept: list[float], base: float = 0.6) -> dict:
@@ -57,7 +60,7 @@ def test_the_default_run_is_held_against_its_control_the_asked_ratio_and_doing_n
     ratio = {"survival_weighted_degradation_ratio": over_seeds([0.05, 0.06, 0.07])}
     found[label]["over_seeds"] = {"policy": {**estimates, **ratio}}
     told = list(claims.of_validity({"results": {"variants": found}}))
-    assert [(of.claim.removeprefix(f"{label}: "), of.verdict) for of in told] == [
+    assert [(of.claim.removeprefix(f"{label}: "), of.word) for of in told] == [
         ("the targets no longer succeed", "holds"),
         ("the kept clips stay as they were", "holds"),
         ("the kept clips are what fine-tuning alone gives", "does not hold"),
@@ -86,7 +89,7 @@ def test_the_comparisons_claims_by_hand():
         claims.FROZEN: variant([0.6, 0.6, 0.6], [0.6, 0.6, 0.6]),
         f"{claims.FROZEN}, wrench": variant([0.7, 0.71, 0.7], [0.6, 0.6, 0.6]),
     }
-    found = {of.claim: of.verdict for of in claims.of_comparison({"results": {"variants": compared}})}
+    found = {of.claim: of.word for of in claims.of_comparison({"results": {"variants": compared}})}
     assert found == {
         "λ = 16: the kept clips are what fine-tuning without an anti-reward gives": "holds",
         "negated reward, plain PPO, hurts the kept clips more than arft": "holds",
@@ -112,10 +115,10 @@ def test_a_policy_that_falls_sooner_than_doing_nothing_has_not_lost_a_skill():
         "λ = 8": {str(seed): {"episode_length": [17.0, 17.0 + seed]} for seed in range(3)},
         "λ = 16": {str(seed): {"episode_length": [5.0, 6.0 + seed]} for seed in range(3)},
     }
-    found = [of.verdict for of in claims.of_physical_behaviour({"results": {"policies": policies}})]
+    found = [of.word for of in claims.of_physical_behaviour({"results": {"policies": policies}})]
     assert found == ["holds", "does not hold"]
     policies["λ = 8"] = {"0": {"episode_length": [50.0, 52.0]}}
-    found = [of.verdict for of in claims.of_physical_behaviour({"results": {"policies": policies}})]
+    found = [of.word for of in claims.of_physical_behaviour({"results": {"policies": policies}})]
     assert found == ["not short", "does not hold"]
     measured = ("foot_contact", "joint_limit_violation", claims.DEVIATION)
     for label, values in (("base", (0.6, 0.1, 0.1)), ("zero action", (0.8, 0.2, 0.12))):
@@ -126,7 +129,7 @@ def test_a_policy_that_falls_sooner_than_doing_nothing_has_not_lost_a_skill():
         of.claim.removeprefix("λ = 16: "): of
         for of in claims.of_physical_behaviour({"results": {"policies": policies}})
     }
-    assert [of.verdict for of in list(found.values())[2:]] == ["holds", "open", "does not hold"]
+    assert [of.word for of in list(found.values())[2:]] == ["holds", "open", "does not hold"]
     assert (
         found["the feet are less on the floor than the base's"].evidence
         == "foot contact 0.410 [0.385, 0.435], base 0.600"
@@ -141,7 +144,7 @@ def test_the_training_curves_are_held_against_what_the_paper_reads_off_them():
         return {"rows": [{name: over_seeds(values) for name, values in at.items()} for at in (first, last)]}
 
     def told(of: dict) -> list[str]:
-        return [of.verdict for of in claims.of_training_dynamics({"results": {"configurations": of}})]
+        return [of.word for of in claims.of_training_dynamics({"results": {"configurations": of}})]
 
     start = {"entropy": [5.0] * 3, "wrench_gain": [0.1, 0.11, 0.12], "top_bin_probability": [0.03] * 3}
     end = {"entropy": [4.0, 4.1, 4.2], "wrench_gain": [0.11, 0.13, 0.12], "top_bin_probability": [0.02, 0.021, 0.022]}
@@ -163,28 +166,51 @@ def test_two_intervals_differ_by_no_more_than_both_say():
     assert found == {"mean": 3.0, "n": 3, "low": pytest.approx(3 - 2 * half), "high": pytest.approx(3 + 2 * half)}
 
 
-def test_half_of_the_skill_gone_below_w_is_asked_of_every_seed():
-    def swept(skills: dict[float, list[float]]) -> dict:
-        return {
-            str(penalty): {
-                "options": {"penalty": penalty},
-                "seeds": {str(seed): {"policy": {"target": {"skill": skill}}} for seed, skill in enumerate(of)},
-                "over_seeds": {"lambda_crit": over_seeds([7.6, 7.7, 7.8])},
-            }
-            for penalty, of in skills.items()
+def swept(skills: dict[float, list[float]]) -> dict:
+    """As the JSON of the penalties has it: by penalty, the skill of each seed."""
+    return {
+        str(penalty): {
+            "options": {"penalty": penalty},
+            "seeds": {str(seed): {"policy": {"target": {"skill": skill}}} for seed, skill in enumerate(of)},
+            "over_seeds": {"lambda_crit": over_seeds([7.6, 7.7, 7.8])},
         }
+        for penalty, of in skills.items()
+    }
 
-    def found(skills: dict[float, list[float]]) -> list[claims.Finding]:
-        return list(claims.of_penalty({"results": {"variants": swept(skills)}}))
 
-    assert found({4.0: [0.9, 0.9, 0.9], 8.0: [0.1, 0.12, 0.11]})[0].verdict == "holds"
-    later = found({8.0: [0.9, 0.9, 0.9], 16.0: [0.1, 0.1, 0.1]})[0]
-    assert later.verdict == "does not hold"
-    assert later.evidence.startswith("half of the skill is gone at λ = 11.3")  # 8 x 2^(0.4 / 0.8)
-    some = found({4.0: [0.9, 0.9, 0.9], 8.0: [0.1, 0.1, 0.9]})[0]
-    assert some.verdict == "open"
-    assert some.evidence.endswith("in 2 of 3 seeds, in the others at none that was tried")
-    assert found({4.0: [0.9], 8.0: [0.9]}) == []
+@pytest.mark.parametrize(
+    ("skills", "word", "evidence"),
+    [
+        # 4 x 2^(0.4 / 0.8), 4 x 2^(0.4 / 0.78) and 4 x 2^(0.4 / 0.79)
+        ({4.0: [0.9, 0.9, 0.9], 8.0: [0.1, 0.12, 0.11]}, "holds", "5.7 [5.6, 5.7], mean of 3 seed(s)"),
+        # 8 x 2^(0.4 / 0.8)
+        ({8.0: [0.9, 0.9, 0.9], 16.0: [0.1, 0.1, 0.1]}, "does not hold", "11.3 [11.3, 11.3], mean of 3 seed(s)"),
+        # the second seed's half is gone below 4: 5.7, at most 4 and 5.7 are below 8 in the mean, [2.7, 7.5]
+        ({4.0: [0.9, 0.3, 0.9], 8.0: [0.1, 0.05, 0.1]}, "holds", "5.7, below 4, 5.7, seed by seed"),
+        ({4.0: [0.3, 0.3, 0.3], 8.0: [0.1, 0.1, 0.1]}, "holds", "below 4, below 4, below 4, seed by seed"),
+        # one seed needs more than was tried
+        ({4.0: [0.9, 0.9, 0.9], 8.0: [0.1, 0.1, 0.9]}, "open", "5.7, 5.7, above 8, seed by seed"),
+        ({4.0: [0.9, 0.9, 0.9], 16.0: [0.9, 0.9, 0.9]}, "does not hold", "above 16, above 16, above 16, seed by seed"),
+        # below the smallest says nothing of a bound that is smaller still
+        ({12.0: [0.3, 0.3, 0.3], 16.0: [0.1, 0.1, 0.1]}, "open", "below 12, below 12, below 12, seed by seed"),
+        ({4.0: [0.3, 0.9, 0.9], 16.0: [0.1, 0.9, 0.9]}, "open", "below 4, above 16, above 16, seed by seed"),
+        ({4.0: [0.3]}, "one seed: yes", "below 4, seed by seed"),
+        ({16.0: [0.9]}, "one seed: no", "above 16, seed by seed"),
+        ({16.0: [0.3]}, "open", "below 16, seed by seed"),
+    ],
+)
+def test_half_of_the_skill_gone_below_w_is_asked_of_every_seed(skills, word, evidence):
+    (found,) = claims.of_penalty({"results": {"variants": swept(skills)}})
+    assert found.word == word
+    assert found.evidence.startswith(f"half of the skill is gone at λ = {evidence}; λ_crit on the base's steps 7.70")
+
+
+def test_half_of_the_skill_is_gone_between_two_penalties_before_the_first_or_after_the_last():
+    crossed = 8.0 * 2.0 ** (0.2 / 0.6)
+    assert sweep.half_gone({16.0: 0.1, 4.0: 0.9, 8.0: 0.7}) == pytest.approx((crossed, crossed))
+    assert sweep.half_gone({4.0: 0.3, 8.0: 0.7, 16.0: 0.1}) == (0.0, 4.0)
+    assert sweep.half_gone({4.0: 0.5}) == (0.0, 4.0)
+    assert sweep.half_gone({4.0: 0.9, 16.0: 0.6}) == (16.0, math.inf)
 
 
 def test_wear_is_what_the_kept_clips_lose_of_their_start():
@@ -192,9 +218,9 @@ def test_wear_is_what_the_kept_clips_lose_of_their_start():
         groups = [{"kept": {"survival_weighted_tracking": over_seeds(of)}} for of in ([0.8, 0.8, 0.8], [0.1] * 3, end)]
         return next(claims.of_heat_map({"asked": {"iterations": 1000}, "results": {"groups": groups}}))
 
-    assert judged([0.78, 0.79, 0.80]).verdict == "holds"
-    assert judged([0.5, 0.51, 0.52]).verdict == "does not hold"
-    assert judged([0.7, 0.8, 0.75]).verdict == "open"
+    assert judged([0.78, 0.79, 0.80]).word == "holds"
+    assert judged([0.5, 0.51, 0.52]).word == "does not hold"
+    assert judged([0.7, 0.8, 0.75]).word == "open"
     assert judged([0.7, 0.8, 0.75]).claim == "1,000 iterations do not wear the kept clips down"
 
 
@@ -203,7 +229,7 @@ def test_any_motion_is_forgotten_and_the_others_stay():
     for label, skill in (("run", [0.1, 0.12, 0.11]), ("dance", [0.5, 0.52, 0.51])):
         runs[label]["over_seeds"] = {"policy": {"target": {"skill": over_seeds(skill)}}}
     told = claims.of_motion_types({"asked": {"robot": "g1"}, "results": {"variants": runs}})
-    assert [(of.claim, of.verdict) for of in told] == [
+    assert [(of.claim, of.word) for of in told] == [
         ("run can be forgotten on the G1", "holds"),
         ("run: the kept clips stay as they were", "does not hold"),
         ("dance can be forgotten on the G1", "does not hold"),
@@ -225,7 +251,7 @@ def test_membership_is_told_by_the_auc_and_by_the_hits(auc, hits, verdict):
     of = {"auc": over_seeds(auc), "tpr_at_5_percent_fpr": over_seeds(hits)}
     asked = {"targets": ["punch", "kick"], "episodes": 20}
     (told,) = claims.of_membership({"asked": asked, "results": {"policies": {"base": of}}})
-    assert told.verdict.startswith(verdict)
+    assert told.word.startswith(verdict)
     assert told.evidence.endswith("guessing 0.07")  # of 41 alike, one is among the first three with a chance of 3 in 41
 
 
@@ -240,21 +266,21 @@ def test_what_comes_back_sooner_than_it_is_learned_was_not_forgotten():
             for label, of in (("unlearned", unlearned), ("distilled", distilled))
         }
         every = list(claims.of_relearning({"results": {"base": dict.fromkeys("012", 0.9), "starts": starts}}))
-        assert len({of.verdict for of in every}) == 1
+        assert len({of.word for of in every}) == 1
         return every[0]
 
     sooner = found([1, 2, 1], [4, 4, 4])
-    assert sooner.verdict == "does not hold"
+    assert sooner.word == "does not hold"
     assert sooner.evidence.startswith("-267 [-410, -123] target steps more than the 400 of the distilled one")
-    assert found([3, 4, 3], [1, 1, 1]).verdict == "holds"
-    assert found([1, 2, 1], [1, 1, 4]).verdict == "open"
+    assert found([3, 4, 3], [1, 1, 1]).word == "holds"
+    assert found([1, 2, 1], [1, 1, 4]).word == "open"
     never = found([1, 2, 1], [4, 9, 9])
-    assert never.verdict == "does not hold"  # later than their runs' ends, which is late enough
+    assert never.word == "does not hold"  # later than their runs' ends, which is late enough
     assert never.evidence.endswith("not reached, counted with the run's end: distilled in 2 of 3 runs")
-    assert found([1, 9, 1], [4, 4, 4]).verdict == "open"
-    assert found([4], [1]).verdict == "one seed: yes"
-    assert found([4], [9]).verdict == "one seed: no"
-    assert found([9], [4]).verdict == "open"
+    assert found([1, 9, 1], [4, 4, 4]).word == "open"
+    assert found([4], [1]).word == "one seed: yes"
+    assert found([4], [9]).word == "one seed: no"
+    assert found([9], [4]).word == "open"
 
 
 def test_relearning_is_held_against_every_control_and_says_which_one_starts_near_the_level():
@@ -267,7 +293,7 @@ def test_relearning_is_held_against_every_control_and_says_which_one_starts_near
 
     starts = {"unlearned": seeds(2, 0.1), "distilled": seeds(3, 0.4), "fresh": seeds(4, 0.09)}
     told = list(claims.of_relearning({"results": {"base": dict.fromkeys("012", 0.9), "starts": starts}}))
-    assert [of.verdict for of in told] == ["the control starts near it", *["does not hold"] * 5]
+    assert [of.word for of in told] == ["the control starts near it", *["does not hold"] * 5]
     assert told[0].evidence.endswith("which starts at 44%")
     assert "than a fresh policy needs" in told[3].claim
     del starts["fresh"]["0"]["iterations"][0]
