@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from math import nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -107,7 +108,7 @@ def unlearning_curves(rows: Sequence[Mapping[str, Any]], path: Path | TextIO, *,
     for panel, (key, title) in enumerate(panels.items()):
         axes = figure.add_subplot(1, len(panels), panel + 1)
         for group in ("target", "kept"):
-            axes.plot(steps, [row[f"{group}/{key}"] for row in rows], label=group, color=GROUP_COLOURS[group])
+            axes.plot(steps, [row.get(f"{group}/{key}", nan) for row in rows], label=group, color=GROUP_COLOURS[group])
         if key == "lambda_crit" and penalty is not None:
             axes.axhline(penalty, color="0.4", linestyle="--", label="λ")
         axes.set_title(title, fontsize="medium")

@@ -344,6 +344,7 @@ def test_a_distilled_policy_starts_afresh_and_is_pulled_towards_the_base_at_any_
     rows = read_rows(output / "metrics.jsonl")
     assert all(row["base_kl"] > 0.0 for row in rows)
     assert all(row["target/step_share"] == 0.0 for row in rows)
+    assert {name for row in rows for name in row if name.startswith("target/")} == {"target/step_share"}
     assert load_config(output / "config.yaml").ppo.base_kl == 1.0
     policies = json.loads((output / "evaluation.json").read_text())["policies"]
     assert policies.keys() == {"base", "unlearned", "zero_action"}
