@@ -88,11 +88,10 @@ def main(options: Options) -> None:
     provenance()  # of the code that is loaded now; a checkout may change while the run trains
     output = options.output or default_folder(f"unlearn-{options.robot}", resume=options.resume)
     prepare_folder(output, resume=options.resume)
-    config = _config_of_run(options, output) if options.resume else config_of_new_run(options)
-    config = override(replace_given(config, iterations=options.iterations), itertools.chain(*options.set))
+    config = config_of(options, output)
     if not config.unlearn.targets:
         raise InputError("--targets: no clip named; name at least one to forget, such as --targets punch,kick")
-    setup = make_setup(on_engine(config, options.physics))
+    setup = make_setup(config)
     base = base_policy(setup)
     setup = dataclasses.replace(setup, base=base)
     info = checkpoint.read_info(base_checkpoint(config))
@@ -119,6 +118,13 @@ def main(options: Options) -> None:
     name = f"{method.result.replace('_', '-')} policy"
     files = {name: path, **show_and_write(output, document), "curves": output / "metrics.jsonl"}
     closing(files, command_line("evaluate", robot=config.robot, checkpoint=path, episodes=100))
+
+
+def config_of(options: Options, output: Path | None = None) -> Config:
+    """Every setting of a run as the options ask for it; with `resume`, of the run in folder `output`."""
+    config = _config_of_run(options, output) if options.resume and output else config_of_new_run(options)
+    config = override(replace_given(config, iterations=options.iterations), itertools.chain(*options.set))
+    return on_engine(config, options.physics)
 
 
 def config_of_new_run(options: Options) -> Config:

@@ -1,6 +1,6 @@
 """Figures of evaluation.json, metrics.jsonl and studies. matplotlib is loaded only when a figure is drawn.
 
-`path` is where a figure goes: a file, whose suffix says the format, or a text buffer, which gets SVG.
+`path` is where a figure goes: a PNG file, or a text buffer, which gets SVG.
 """
 
 from __future__ import annotations
@@ -181,13 +181,12 @@ def new_figure(*, width: float, height: float) -> Figure:
 
 
 def save(figure: Figure, path: Path | TextIO) -> None:
-    """Write a figure as its path's ending says; an SVG of the same figure is the same file."""
+    """Write a figure as PNG to a path, or as SVG to a text buffer."""
     import matplotlib
 
     if isinstance(path, Path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with matplotlib.rc_context({"svg.hashsalt": path.stem}):
-            figure.savefig(path, dpi=150, metadata={"Date": None} if path.suffix == ".svg" else None)
+        figure.savefig(path, dpi=150)
         return
     # In a page: text stays text, in the page's own font.
     with matplotlib.rc_context({"svg.hashsalt": "page", "svg.fonttype": "none", "font.family": "sans-serif"}):

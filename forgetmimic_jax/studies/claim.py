@@ -3,10 +3,10 @@
 A claim *holds* where the whole 95 % interval of its number over the seeds lies on the right side of the bound, *does
 not hold* where the interval lies on the wrong side, and is *open* between. One seed has no interval.
 
-A study states many claims, and of many intervals at 95 % each some miss by chance. The words of one study are
-therefore corrected for their number by Holm's method: the chance that any of them is wrong is at most 5 %. Holm and not
-Benjamini-Hochberg, because the claims of a study are about the same few runs, and Holm's bound needs nothing known
-about how they depend on each other.
+Of many intervals at 95 % some miss by chance. The words of a study are therefore corrected for their number by Holm's
+method, those that answer its main claim and those of its further findings apart: in either family the chance that any
+word is wrong is at most 5 %. Holm and not Benjamini-Hochberg, because the claims of a study are about the same few
+runs, and Holm's bound needs nothing known about how they depend on each other.
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ from scipy import stats
 
 from forgetmimic_jax.evaluation import statistics
 from forgetmimic_jax.evaluation.statistics import Estimate
+from forgetmimic_jax.evaluation.tables import markdown_table
 
+LEVEL = 0.05
 HOLDS, FAILS, OPEN = "holds", "does not hold", "open"
 ONE_SEED = {HOLDS: "one seed: yes", FAILS: "one seed: no"}
 
@@ -36,6 +38,7 @@ class Finding:
         evidence: the number and its bound.
         seeds: how many runs the number is over.
         p: two-sided p-value of the number against its bound; None where nothing was tested, as with one seed.
+        main: whether it is a part of the answer to the study's claim of the paper.
     """
 
     claim: str
@@ -43,6 +46,7 @@ class Finding:
     evidence: str
     seeds: int
     p: float | None = None
+    main: bool = False
 
 
 class Between(NamedTuple):
@@ -80,13 +84,15 @@ def p_value(value: Estimate, bound: float) -> float | None:
     return float(2.0 * stats.t.sf(distance / error, value["n"] - 1))
 
 
-def finding(claim: str, value: Estimate, bound: float, evidence: str, *, below: bool = True) -> Finding:
+def finding(
+    claim: str, value: Estimate, bound: float, evidence: str, *, below: bool = True, main: bool = False
+) -> Finding:
     """A claim that a number lies below (or above) a bound."""
-    return Finding(claim, judged(value, bound, below=below), evidence, value["n"], p_value(value, bound))
+    return Finding(claim, judged(value, bound, below=below), evidence, value["n"], p_value(value, bound), main)
 
 
 def finding_between(
-    claim: str, values: Sequence[Between], bound: float, evidence: str, *, below: bool = True
+    claim: str, values: Sequence[Between], bound: float, evidence: str, *, below: bool = True, main: bool = False
 ) -> Finding:
     """The same of numbers, one a seed, of which some were not measured but only bounded.
 
@@ -97,24 +103,50 @@ def finding_between(
     cautious, generous = (highs, lows) if below else (lows, highs)
     for ends, word in ((cautious, HOLDS), (generous, FAILS)):
         if np.isfinite(ends).all():
-            found = finding(claim, statistics.over_seeds(ends), bound, evidence, below=below)
+            found = finding(claim, statistics.over_seeds(ends), bound, evidence, below=below, main=main)
             if found.word in (word, ONE_SEED[word]):
                 return found
-    return Finding(claim, OPEN, evidence, len(values), None if len(values) == 1 else 1.0)
+    tested = len(values) > 1 and (np.isfinite(lows).all() or np.isfinite(highs).all())
+    return Finding(claim, OPEN, evidence, len(values), 1.0 if tested else None, main)
 
 
-def corrected(findings: Iterable[Finding], level: float = 0.05) -> list[Finding]:
-    """The findings of a study with the words that are left after Holm's correction (Holm 1979).
+def corrected(findings: Iterable[Finding]) -> list[Finding]:
+    """The findings of a study with the words that remain after Holm's correction, in each of the two families."""
+    findings = list(findings)
+    undecided = {id(found) for main in (True, False) for found in _undecided([f for f in findings if f.main == main])}
+    return [dataclasses.replace(found, word=OPEN) if id(found) in undecided else found for found in findings]
+
+
+def _undecided(family: Sequence[Finding]) -> list[Finding]:
+    """What Holm's method leaves open (Holm 1979, "A simple sequentially rejective multiple test procedure").
 
     The smallest of m p-values is compared with level / m, the next with level / (m - 1), and so on; from the first that
     is larger, all are open.
     """
-    findings = list(findings)
-    tested = sorted((p, place) for place, found in enumerate(findings) if (p := found.p) is not None)
-    left = len(tested)
-    while left and tested[-left][0] <= level / left:
-        left -= 1
-    undecided = {place for _, place in tested[len(tested) - left :]}
-    return [
-        dataclasses.replace(found, word=OPEN) if place in undecided else found for place, found in enumerate(findings)
+    tested = sorted((found for found in family if found.p is not None), key=lambda found: found.p or 0.0)
+    for place, found in enumerate(tested):
+        if (found.p or 0.0) > LEVEL / (len(tested) - place):
+            return tested[place:]
+    return []
+
+
+def answer(claim: str, findings: Iterable[Finding]) -> Finding:
+    """A study's answer to its claim: the claim holds where all main findings do, and fails where one does.
+
+    Args:
+        claim: the paper's, in one sentence.
+        findings: of the study, corrected.
+    """
+    main = [found for found in findings if found.main]
+    words = {found.word for found in main}
+    word = FAILS if FAILS in words else words.pop() if len(words) == 1 else OPEN
+    return Finding(claim, word, "; ".join(found.evidence for found in main), min(found.seeds for found in main))
+
+
+def findings_table(findings: Iterable[Finding]) -> str:
+    """The findings of a study, the main ones first, in Markdown."""
+    rows = [
+        [found.claim, f"**{found.word}**", found.evidence, str(found.seeds)]
+        for found in sorted(findings, key=lambda found: not found.main)
     ]
+    return markdown_table(["claim", "here", "number", "seeds"], rows)
