@@ -26,8 +26,9 @@ from forgetmimic_jax.basics.errors import InputError, run_command
 from forgetmimic_jax.basics.files import write_atomically
 from forgetmimic_jax.evaluation.tables import markdown_table
 from forgetmimic_jax.studies.claim import answer, corrected
+from forgetmimic_jax.studies.conduct import RESULTS
 from forgetmimic_jax.studies.document import read_document
-from forgetmimic_jax.studies.study import RESULTS, Study
+from forgetmimic_jax.studies.study import Study
 
 README = Path(__file__).parent / "README.md"
 BLOCK = re.compile(r"(<!-- claims:start -->\n).*?(<!-- claims:end -->)", re.DOTALL)

@@ -10,9 +10,10 @@ from forgetmimic_jax.evaluation import statistics
 from forgetmimic_jax.evaluation.tables import markdown_table, number
 from forgetmimic_jax.studies import paper, samplers
 from forgetmimic_jax.studies.claim import Finding, finding
+from forgetmimic_jax.studies.conduct import main
 from forgetmimic_jax.studies.findings import SUCCESS, kept_stay, mean_gained
 from forgetmimic_jax.studies.lab import Lab
-from forgetmimic_jax.studies.study import Document, Study, main
+from forgetmimic_jax.studies.study import Document, Study
 from forgetmimic_jax.studies.variants import TRACKING, paired, variant_bars, variant_table
 from forgetmimic_jax.unlearning import distill
 from forgetmimic_jax.unlearning.method import SHORT

@@ -15,8 +15,9 @@ from forgetmimic_jax.evaluation.statistics import Estimate
 from forgetmimic_jax.evaluation.tables import markdown_table, number
 from forgetmimic_jax.studies import paper
 from forgetmimic_jax.studies.claim import FAILS, OPEN, Finding, finding, p_value
+from forgetmimic_jax.studies.conduct import main
 from forgetmimic_jax.studies.lab import Lab, newest_policy
-from forgetmimic_jax.studies.study import Document, Study, main
+from forgetmimic_jax.studies.study import Document, Study
 from forgetmimic_jax.studies.variants import over_seeds, within
 
 if TYPE_CHECKING:

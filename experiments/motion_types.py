@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from forgetmimic_jax.studies.study import main
+from forgetmimic_jax.studies.conduct import main
 from forgetmimic_jax.studies.targets import targets_study
 
 STUDY = targets_study(name="motion_types")

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from forgetmimic_jax.studies import paper
+from forgetmimic_jax.studies.conduct import main
 from forgetmimic_jax.studies.lab import Options
-from forgetmimic_jax.studies.study import main
 from forgetmimic_jax.studies.targets import targets_study
 
 GROUPS = ("dance_a", "punch,kick", "jump,spinkick,cartwheel")  # dance, combat and acrobatics, as in the paper

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from forgetmimic_jax.studies.conduct import main
 from forgetmimic_jax.studies.penalty import penalty_study
-from forgetmimic_jax.studies.study import main
 
 STUDY = penalty_study()
 

@@ -14,20 +14,27 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import numpy as np
 
 from forgetmimic_jax.basics.files import read_rows
 from forgetmimic_jax.evaluation import statistics
+from forgetmimic_jax.evaluation.document import FILE, read_evaluation
 from forgetmimic_jax.evaluation.plots import new_figure
-from forgetmimic_jax.evaluation.relearning import Lasted, at_first, lasted
+from forgetmimic_jax.evaluation.relearning import Lasted, Origin, Origins, at_first, comparable_settings, lasted
 from forgetmimic_jax.evaluation.tables import markdown_table, number, percent
+from forgetmimic_jax.evaluation.verdict import retained, skills
+from forgetmimic_jax.settings.config import load_config
 from forgetmimic_jax.studies import paper
 from forgetmimic_jax.studies.claim import Between, Finding, finding_between
+from forgetmimic_jax.studies.conduct import main
 from forgetmimic_jax.studies.findings import share
 from forgetmimic_jax.studies.lab import Lab, newest_policy
-from forgetmimic_jax.studies.study import ITERATIONS, Document, Study, main
+from forgetmimic_jax.studies.study import ITERATIONS, Document, Study
 from forgetmimic_jax.studies.variants import TRACKING, within
+from forgetmimic_jax.training.checkpoint import policy_hash
 from forgetmimic_jax.unlearning.method import FINE_TUNING, SHORT
+from forgetmimic_jax.unlearning.registry import method_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -46,7 +53,8 @@ def measure(lab: Lab) -> dict[str, Any]:
     asked |= {("distilled", seed): {**length, "method": "distill", "seed": seed} for seed in lab.seeds}
     retrain = {"method": "retrain", "iterations": lab.control_iterations}
     asked |= {("retrained", seed): {**retrain, "seed": seed} for seed in lab.control_seeds}
-    policies = {key: newest_policy(folder) for key, folder in lab.run(asked, "policies to relearn from").items()}
+    folders = lab.run(asked, "policies to relearn from")
+    policies = {key: newest_policy(folder) for key, folder in folders.items()}
     relearned = lab.run(relearning_runs(lab, policies), "relearning")
     base: dict[str, float] = {}
     curves: dict[str, Any] = {label: {} for label, _ in relearned}
@@ -57,7 +65,24 @@ def measure(lab: Lab) -> dict[str, Any]:
         for (label, of), folder in relearned.items():
             if of == seed:
                 curves[label][str(seed)] = curve_of(folder, lab.targets, first.get(label))
-    return {"base": base, "starts": curves}
+    return {"base": base, "starts": curves, "origins": msgspec.to_builtins(origins(lab, folders))}
+
+
+def origins(lab: Lab, folders: Mapping[tuple[str, int], Path]) -> Origins:
+    """How the policies of each start were trained, so that a report can see whether the curves belong to its run.
+
+    Args:
+        lab: of the study.
+        folders: by start and seed, the run that trained the policy.
+    """
+    starts: dict[str, Origin] = {}
+    for (label, seed), folder in folders.items():
+        config = load_config(folder / "config.yaml")
+        origin = starts.setdefault(label, Origin(comparable_settings(config), {}))
+        kept = skills(read_evaluation(folder / FILE).policies[method_of(config).result], target=False)
+        if kept:
+            origin.kept_skill[str(seed)] = retained(kept).estimate
+    return Origins(policy_hash(lab.info), starts)
 
 
 def relearning_runs(lab: Lab, policies: Mapping[tuple[str, int], Path]) -> dict[tuple[str, int], dict[str, Any]]:
@@ -68,7 +93,7 @@ def relearning_runs(lab: Lab, policies: Mapping[tuple[str, int], Path]) -> dict[
     back would do the same.
     """
     name = lab.options.preset
-    pace = {**SHORT, "schedule": "fixed", "anchor": 0.0} if name == "cpu" else {}
+    pace = {**SHORT, "schedule": "fixed", "base_kl": 0.0} if name == "cpu" else {}
     alike = [f"ppo.{setting}={json.dumps(value)}" for setting, value in pace.items()]
     alike += ["wrench.max_gain=0.0", f"sampling.target_share={FINE_TUNING.target_share.get(name, 0.0)}"]
     watched = {"clips": "all", "set": [*lab.watched(EVALUATIONS), *alike]}

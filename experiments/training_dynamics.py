@@ -10,8 +10,9 @@ from forgetmimic_jax.evaluation.plots import new_figure
 from forgetmimic_jax.evaluation.statistics import Estimate
 from forgetmimic_jax.evaluation.tables import FORGOTTEN, markdown_table, number
 from forgetmimic_jax.studies.claim import Finding, finding
+from forgetmimic_jax.studies.conduct import main
 from forgetmimic_jax.studies.lab import Lab
-from forgetmimic_jax.studies.study import Document, Study, main
+from forgetmimic_jax.studies.study import Document, Study
 from forgetmimic_jax.studies.variants import over_seeds
 
 if TYPE_CHECKING:

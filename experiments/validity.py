@@ -12,9 +12,10 @@ from forgetmimic_jax.evaluation.metrics import ZERO_ACTION
 from forgetmimic_jax.evaluation.tables import number, percent
 from forgetmimic_jax.studies import paper
 from forgetmimic_jax.studies.claim import Finding, finding
+from forgetmimic_jax.studies.conduct import main
 from forgetmimic_jax.studies.findings import SUCCESS, kept_stay, mean_gained, no_success, skill_gone
 from forgetmimic_jax.studies.lab import Lab
-from forgetmimic_jax.studies.study import Document, main, variants_study
+from forgetmimic_jax.studies.study import Document, variants_study
 from forgetmimic_jax.studies.variants import DEVIATION, TRACKING, estimates, variant_table, within
 from forgetmimic_jax.unlearning.method import FINE_TUNING
 
@@ -24,7 +25,7 @@ SOONER = 1.0  # steps by which an episode may end before the zero-action baselin
 NO_FURTHER_OFF = "until it falls it is no further off a target than the zero-action baseline"
 CONTROL = "fine-tuned, all clips"
 # The paper's loss and starts, at our step size and length.
-PLAIN = {"set": ["ppo.anchor=0.0", "ppo.equal_clips=false", "sampling.target_share=0.0"]}
+PLAIN = {"set": ["ppo.base_kl=0.0", "ppo.equal_clips=false", "sampling.target_share=0.0"]}
 WHOLE = FINE_TUNING.iterations  # of `make unlearn`, by preset
 
 

@@ -13,10 +13,11 @@ from forgetmimic_jax.basics.errors import run_command
 from forgetmimic_jax.settings.options import parse
 from forgetmimic_jax.studies import lab, paper
 from forgetmimic_jax.studies.claim import Finding
+from forgetmimic_jax.studies.conduct import conduct
 from forgetmimic_jax.studies.findings import forgotten_and_kept, kept_stay, no_success, skill_gone
 from forgetmimic_jax.studies.penalty import penalty_study
 from forgetmimic_jax.studies.samplers import sampler_study
-from forgetmimic_jax.studies.study import Document, Study, conduct, variants_study
+from forgetmimic_jax.studies.study import Document, Study, variants_study
 from forgetmimic_jax.studies.targets import targets_study
 
 

@@ -17,7 +17,7 @@ from forgetmimic_jax.basics.files import write_atomically
 from forgetmimic_jax.basics.provenance import provenance
 
 SCHEMA = 2
-DIGITS = 7  # significant ones of a number
+DIGITS = 9  # significant ones of a number
 
 
 class Known(NamedTuple):
@@ -70,7 +70,7 @@ def made_by(runs: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 def origin_of(trial: Path) -> dict[str, Any]:
     """What made a finished trial: what its evaluation says, or this process if the code is this process's."""
-    said = json.loads((trial / "evaluation.json").read_text()).get("provenance")
+    said = json.loads((trial / "evaluation.json").read_text()).get("made")
     if said:
         return said
     here, code = dataclasses.asdict(provenance()), trial.name.rpartition("-")[2]

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from forgetmimic_jax.studies.claim import corrected, findings_table
 from forgetmimic_jax.studies.document import code_text
 from forgetmimic_jax.studies.lab import watched_episodes
-
-if TYPE_CHECKING:
-    from forgetmimic_jax.studies.study import Study
+from forgetmimic_jax.studies.study import Study
 
 LAPTOP = (
     "- With the cpu preset unlearning is KL-regularised towards the base on the kept clips, weighs all clips the same "

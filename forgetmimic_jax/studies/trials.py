@@ -24,7 +24,6 @@ from typing import IO, Any
 
 from rich.console import Console
 
-from forgetmimic_jax import unlearn
 from forgetmimic_jax.basics.console import progress
 from forgetmimic_jax.basics.errors import Interrupted
 from forgetmimic_jax.basics.files import read_rows
@@ -36,6 +35,7 @@ from forgetmimic_jax.tracking.setup import library_folder
 from forgetmimic_jax.training import checkpoint
 from forgetmimic_jax.training.checkpoint import newest_checkpoint
 from forgetmimic_jax.training.start import base_checkpoint
+from forgetmimic_jax.training.unlearning_run import Options, config_of
 
 POLL = 1.0  # s between two looks at the running trials
 
@@ -77,8 +77,8 @@ def make_trial(root: Path, options: Mapping[str, Any]) -> Trial:
     episodes, and the contents of base, clips and robot; CODE is over the package's Python files. Where base and clips
     lie does not count.
     """
-    given = unlearn.Options(**{**options, "set": [list(options.get("set", []))]})
-    config = unlearn.config_of(given)
+    given = Options(**{**options, "set": [list(options.get("set", []))]})
+    config = config_of(given)
     base = checkpoint.fingerprint(base_checkpoint(config))
     robot = [path.read_text() for path in sorted(roles_file(config.robot).parent.glob("*.*ml"))]
     plain = dataclasses.replace(config, base=None, library=None)
@@ -94,11 +94,11 @@ def without_code(name: str) -> str:
     return name.rpartition("-")[0]
 
 
-def flags_of(options: unlearn.Options) -> tuple[str, ...]:
+def flags_of(options: Options) -> tuple[str, ...]:
     """The command line of options that are not the defaults."""
     flags: list[str] = []
     for option in fields(options):
-        value, default = getattr(options, option.name), getattr(unlearn.Options(), option.name)
+        value, default = getattr(options, option.name), getattr(Options(), option.name)
         if option.name == "set":
             value, default = list(itertools.chain(*value)), []
         if value != default:

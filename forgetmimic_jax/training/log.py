@@ -14,7 +14,7 @@ from tensorboardX.proto.event_pb2 import Event, SessionLog
 from tensorboardX.proto.summary_pb2 import Summary
 
 from forgetmimic_jax.basics.files import drop_rows_after
-from forgetmimic_jax.unlearning.threshold import GROUPS
+from forgetmimic_jax.ppo.threshold import GROUPS
 
 Metrics = Mapping[str, np.ndarray]
 

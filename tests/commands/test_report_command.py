@@ -20,6 +20,7 @@ from forgetmimic_jax.reporting import films
 from forgetmimic_jax.settings.config import load_config
 from forgetmimic_jax.settings.options import override, parse
 from forgetmimic_jax.training.checkpoint import policy_hash, read_info
+from forgetmimic_jax.training.unlearning_run import config_of_new_run
 from forgetmimic_jax.viewing import film, offscreen
 
 FILM = [np.full((48, 64, 3), grey, np.uint8) for grey in (0, 128, 255)]
@@ -140,7 +141,7 @@ def test_the_command_that_reproduces_it_gives_the_runs_settings(facts, run):
     words = command.split()
     assert words[:2] == ["forgetmimic", "unlearn"]
     options = parse(unlearn.Options, "unlearn", words[2:])
-    config = override(unlearn.config_of_new_run(options), [setting for group in options.set for setting in group])
+    config = override(config_of_new_run(options), [setting for group in options.set for setting in group])
     assert dataclasses.replace(config, iterations=options.iterations) == load_config(run / "config.yaml")
     assert page == f"forgetmimic report --run {run}"
 

@@ -16,7 +16,7 @@ from forgetmimic_jax import sweep, unlearn
 from forgetmimic_jax.basics.errors import InputError, Interrupted
 from forgetmimic_jax.basics.provenance import provenance
 from forgetmimic_jax.settings.options import parse
-from forgetmimic_jax.studies import lab, study, trials
+from forgetmimic_jax.studies import conduct, lab, trials
 from forgetmimic_jax.studies.targets import targets_study
 from forgetmimic_jax.studies.variants import estimates
 
@@ -165,7 +165,9 @@ def by_other_code(swept, tmp_path) -> Path:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "seeds.json").write_text(text)
     for trial in (swept[0] / "trials").glob("*-s*/"):
-        shutil.copytree(trial, tmp_path / "trials" / trial.name.replace(provenance().code, OTHER.code))
+        copy = shutil.copytree(trial, tmp_path / "trials" / trial.name.replace(provenance().code, OTHER.code))
+        evaluation = json.loads((trial / "evaluation.json").read_text())
+        (copy / "evaluation.json").write_text(json.dumps(evaluation | {"made": dataclasses.asdict(OTHER)}))
     return tmp_path
 
 
@@ -320,7 +322,7 @@ def test_help_lists_what_a_study_takes(capsys):
     validity = importlib.import_module("experiments.validity").STUDY
     commands = (
         lambda: parse(sweep.Options, "sweep", ["--help"]),
-        lambda: study.main(validity, arguments=["--help"]),
+        lambda: conduct.main(validity, arguments=["--help"]),
     )
     for command in commands:
         with pytest.raises(SystemExit) as exit_:
@@ -358,7 +360,7 @@ def test_every_study_comes_to_its_page_and_figure(name, base_run, watched_run, t
     other_clips = name in ("motion_types", "number_of_targets")
     subject = targets_study(("turn", "nod"), name, module.STUDY.title) if other_clips else module.STUDY
     given = options(lab.Options, base_run, tmp_path)
-    run = finished(lambda given: study.conduct(subject, given, "make experiments"), given)
+    run = finished(lambda given: conduct.conduct(subject, given, "make experiments"), given)
     out = tmp_path / "out"
     assert sorted(path.suffix for path in out.glob(f"{name}.*")) == [".json", ".md", ".png"]
     assert asked_for
@@ -384,7 +386,7 @@ def test_the_comparison_asks_for_every_method_and_every_sampler_with_and_without
     monkeypatch.setattr(trials, "run_trials", stand_in)
     module = importlib.import_module("experiments.comparison")
     given = options(lab.Options, base_run, tmp_path, control_iterations=7)
-    finished(lambda given: study.conduct(module.STUDY, given, ""), given)
+    finished(lambda given: conduct.conduct(module.STUDY, given, ""), given)
     from forgetmimic_jax.unlearning.registry import methods
 
     assert {key[0] for key in asked_for} == methods().keys()

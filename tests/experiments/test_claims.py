@@ -2,9 +2,9 @@
 
 from experiments import claims
 from forgetmimic_jax.studies.claim import answer, corrected
+from forgetmimic_jax.studies.conduct import RESULTS
 from forgetmimic_jax.studies.document import read_document, write_document
 from forgetmimic_jax.studies.page import page
-from forgetmimic_jax.studies.study import RESULTS
 
 
 def test_each_study_is_a_row_and_one_that_is_not_measured_is_named(tmp_path):

@@ -23,6 +23,7 @@ from forgetmimic_jax.settings.options import parse
 from forgetmimic_jax.studies import trials
 from forgetmimic_jax.studies.trials import Trial, make_trial, run_trials, without_code
 from forgetmimic_jax.training.start import base_folder
+from forgetmimic_jax.training.unlearning_run import config_of
 from forgetmimic_jax.unlearning import method
 
 RUN = """#!{python}
@@ -147,15 +148,15 @@ def test_a_trials_folder_says_what_it_is_and_its_flags_make_its_settings(tmp_pat
     assert re.fullmatch(rf"arft-punch\+kick-s2-[0-9a-f]{{8}}-{provenance().code}", found.folder.name)
     assert found.flags == ("--iterations", "5", "--seed", "2", "--base", str(base))
     asked = {"base": base, "iterations": 5, "penalty": 8.0, "wrench": True, "sampler": None, "targets": "run, walk"}
-    other = make_trial(tmp_path, {**asked, "physics": "native", "set": ["ppo.anchor=0.5", "ppo.epochs=7"]})
+    other = make_trial(tmp_path, {**asked, "physics": "native", "set": ["ppo.base_kl=0.5", "ppo.epochs=7"]})
     assert other.folder.name.startswith("arft-run+walk-s0-")
     assert without_code(other.folder.name) + f"-{provenance().code}" == other.folder.name
     config = other.config
-    assert (config.unlearn.penalty, config.ppo.anchor, config.ppo.epochs) == (8.0, 0.5, 7)
+    assert (config.unlearn.penalty, config.ppo.base_kl, config.ppo.epochs) == (8.0, 0.5, 7)
     assert (config.iterations, other.iterations, config.physics.engine) == (5, 5, "native")
     assert config.wrench.max_gain > 0.0
     for trial in (found, other):  # what the process makes of the flags is the trial's config
-        assert unlearn.config_of(parse(unlearn.Options, "unlearn", trial.flags)) == trial.config
+        assert config_of(parse(unlearn.Options, "unlearn", trial.flags)) == trial.config
 
 
 def test_the_same_question_has_the_same_folder_wherever_its_base_lies(tmp_path, base):
@@ -164,7 +165,7 @@ def test_the_same_question_has_the_same_folder_wherever_its_base_lies(tmp_path, 
     same = make_trial(tmp_path, {"penalty": 8.0, "iterations": 5, "method": "arft", "base": moved})
     assert make_trial(tmp_path, asked).folder == same.folder
     assert make_trial(tmp_path, {**asked, "targets": "punch,kick"}).folder == same.folder  # the default
-    different = [{"penalty": 9.0}, {"iterations": 6}, {"seed": 1}, {"set": ["ppo.anchor=0.5"]}, {"episodes": 3}]
+    different = [{"penalty": 9.0}, {"iterations": 6}, {"seed": 1}, {"set": ["ppo.base_kl=0.5"]}, {"episodes": 3}]
     folders = {make_trial(tmp_path, asked | change).folder for change in different}
     meta = json.loads((base / "meta.json").read_text())
     (base / "meta.json").write_text(json.dumps({**meta, "iteration": meta["iteration"] + 1}))

@@ -24,15 +24,16 @@ def document(groups: list[dict], variants: dict | None = None) -> dict:
     return {"schema": 2, "study": "s", "asked": {}, "made_by": groups, "failed": {}, "results": {"variants": variants}}
 
 
-def test_a_document_comes_back_with_seven_digits_and_a_line_for_each_innermost_table(tmp_path):
+def test_a_document_comes_back_with_nine_digits_and_a_line_for_each_innermost_table(tmp_path):
     content = document([], {"λ = 8": {"seeds": {"0": {"x": 1 / 3, "y": [2.0, 1e6 / 7.0]}}}})
     path = tmp_path / "new" / "s.json"
     write_document(path, content)
-    assert read_document(path)["results"]["variants"]["λ = 8"]["seeds"]["0"] == {"x": 0.3333333, "y": [2.0, 142857.1]}
+    (found,) = read_document(path)["results"]["variants"].values()
+    assert found == {"seeds": {"0": {"x": 0.333333333, "y": [2.0, 142857.143]}}}
     assert json.loads(path.read_text()) == read_document(path)
     lines = [line.strip() for line in path.read_text().splitlines()]
     assert '"asked": {},' in lines
-    assert '"y": [2.0, 142857.1]' in lines
+    assert '"y": [2.0, 142857.143]' in lines
     assert read_document(tmp_path / "gone.json") is None
 
 
@@ -55,7 +56,7 @@ def test_runs_of_one_origin_are_one_group():
 
 
 def test_a_trials_origin_is_what_its_evaluation_says_or_this_process_for_its_own_code(tmp_path):
-    for name, content in (("t-" + HERE["code"], {}), ("t-0123abcd", {}), ("t-9", {"provenance": OTHER})):
+    for name, content in (("t-" + HERE["code"], {}), ("t-0123abcd", {}), ("t-9", {"made": OTHER})):
         (tmp_path / name).mkdir()
         (tmp_path / name / "evaluation.json").write_text(json.dumps(content))
     assert origin_of(tmp_path / f"t-{HERE['code']}") == HERE
