@@ -2,20 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from experiments.validity import PLAIN
-from forgetmimic_jax.evaluation import paper, statistics
+from forgetmimic_jax.evaluation import statistics
 from forgetmimic_jax.evaluation.tables import markdown_table, number
-from forgetmimic_jax.evaluation.variants import paired, variant_bars, variant_table
-from forgetmimic_jax.studies.study import Lab, Study, main
-from forgetmimic_jax.sweep import ablation
-from forgetmimic_jax.unlearning.distill import PACE as DISTILL_PACE
+from forgetmimic_jax.studies import paper, samplers
+from forgetmimic_jax.studies.claim import Finding, finding
+from forgetmimic_jax.studies.conduct import main
+from forgetmimic_jax.studies.findings import SUCCESS, kept_stay, mean_gained
+from forgetmimic_jax.studies.lab import Lab
+from forgetmimic_jax.studies.study import Document, Study
+from forgetmimic_jax.studies.variants import TRACKING, paired, variant_bars, variant_table
+from forgetmimic_jax.unlearning import distill
 from forgetmimic_jax.unlearning.method import SHORT
 
+ARFT, PLAIN_ARFT = "arft", "arft, plain PPO"
 CONTROL = "fine-tuned, all clips"
 PAPERS = ("random_reward", "negated_reward", "decremental", "trajdeleter")  # baselines that the paper has claims about
+INCOMPLETE = ("random_reward", "trajdeleter")  # of them, those that the paper says forget less
+
+
+def plain(method: str) -> str:
+    """The row of a baseline at the paper's own loss."""
+    return f"{method.replace('_', ' ')}, plain PPO"
+
+
 METHODS: dict[str, dict[str, Any]] = {
     "fine-tuned, kept clips": {"method": "finetune"},
     CONTROL: {"method": "finetune", "clips": "all"},
@@ -27,42 +40,38 @@ METHODS: dict[str, dict[str, Any]] = {
             *("negated_reward", "gradient_ascent", "policy_edit", "distill"),
         )
     },
-    "arft": {},
+    ARFT: {},
     "arft, λ = 8": {"penalty": 8.0},
-    "arft, plain PPO": PLAIN,
-    **{f"{name.replace('_', ' ')}, plain PPO": {"method": name, **PLAIN} for name in PAPERS},
+    PLAIN_ARFT: PLAIN,
+    **{plain(name): {"method": name, **PLAIN} for name in PAPERS},
 }
 
 
 def measure(lab: Lab) -> dict[str, Any]:
-    """Every method and the ablation; a retrained policy as often as the budget allows."""
+    """Every method and the ablation; a retrained policy as often as the preset allows."""
     retrain = {"retrained": {"method": "retrain", "iterations": lab.control_iterations}}
-    arft = {f"arft, {label}": variant for label, variant in ablation().items()}
+    arft = {f"{ARFT}, {label}": variant for label, variant in samplers.ablation().items()}
     return lab.over_seeds({**METHODS, **arft, **retrain}, "comparison", seeds={"retrained": lab.control_seeds})
 
 
-def tell(document: Mapping[str, Any]) -> str:
+def body(document: Document) -> str:
     """The table, and the differences from base and fine-tuned control, seed by seed."""
     variants, asked = document["results"]["variants"], document["asked"]
     parts = [variant_table(variants, paper.COMPARISON)]
     if "retrained" in variants:
         parts.append(
-            f"*retrained*: {asked['control_iterations']:,} iterations from scratch with the base's own settings, which "
-            f"took {asked['base_environment_steps']:,} environment steps to make the base. *arft* is λ = 16; the rows "
-            "by sampler are too, each at the shares of the starts that its rule gives.\n"
+            f"*retrained*: {asked['control_iterations']:,} iterations from scratch with the base's own settings; the "
+            f"base itself was trained for {asked['base_environment_steps']:,} environment steps. *arft* has λ = 16, "
+            "also in the rows by sampler, where each sampler gives the targets its own share of the starts.\n"
         )
-    if "decremental" in variants and asked["budget"] == "cpu":
+    if asked["preset"] == "cpu":
         parts.append(
-            "*decremental* and *policy edit* have losses of their own, without the anchor and the clips' weights; of "
-            "the cpu budget's pace they have the starts, and *plain PPO* takes those away.\n"
+            "*decremental* and *policy edit* have losses of their own, without the KL to the base and the clips' "
+            "weights; of the cpu preset they have the starts, and *plain PPO* has not.\n"
         )
-    if "distill" in variants and asked["budget"] == "cpu":
-        steps = {
-            name: of["minibatches"] * of["epochs"]
-            for name, of in (("distill", DISTILL_PACE.ppo["cpu"]), ("the others", SHORT))
-        }
-        told = ", ".join(f"{name} {count}" for name, count in steps.items())
-        parts.append(f"Gradient steps an iteration: {told}.\n")
+        steps = {"distill": distill.PACE.ppo["cpu"], "the others": SHORT}
+        counts = ", ".join(f"{name} {of['minibatches'] * of['epochs']}" for name, of in steps.items())
+        parts.append(f"Gradient steps an iteration: {counts}.\n")
     if CONTROL in variants:
         header = ["", "kept success - base's, points", "- the control's", "kept tracking / base's", "/ the control's"]
         rows = [[label, *against_base_and_control(variants, label)] for label in variants]
@@ -74,8 +83,8 @@ def tell(document: Mapping[str, Any]) -> str:
 def against_base_and_control(variants: Mapping[str, Any], label: str) -> list[str]:
     """Points of success that kept clips gained on the base's and the control's of the same seed; retained tracking."""
     kinds: list[tuple[str, Callable[[float, float], float], int]] = [
-        ("success_rate", lambda mine, theirs: 100.0 * (mine - theirs), 1),
-        ("survival_weighted_tracking", lambda mine, theirs: mine / theirs, 3),
+        (SUCCESS, lambda mine, theirs: 100.0 * (mine - theirs), 1),
+        (TRACKING, lambda mine, theirs: mine / theirs, 3),
     ]
     cells = []
     for metric, against, digits in kinds:
@@ -86,14 +95,50 @@ def against_base_and_control(variants: Mapping[str, Any], label: str) -> list[st
     return cells
 
 
+def findings(document: Document) -> Iterator[Finding]:
+    """Against the paper's baselines, the control, and the ablation."""
+    variants = document["results"]["variants"]
+    for method in PAPERS:
+        kept = mean_gained(variants, PLAIN_ARFT, plain(method), "kept", TRACKING)
+        if kept:
+            name = method.replace("_", " ")
+            evidence = f"kept tracking of arft minus that of {name} {number(kept, 2)}; bound 0"
+            claim = f"arft keeps the other clips better than {name} (both plain PPO)"
+            yield finding(claim, kept, 0.0, evidence, below=False, main=True)
+    for method in INCOMPLETE:
+        target = mean_gained(variants, PLAIN_ARFT, plain(method), "target", TRACKING)
+        if target:
+            name = method.replace("_", " ")
+            evidence = f"target tracking of arft minus that of {name} {number(target, 2)}; bound 0"
+            yield finding(f"arft forgets more than {name} (both plain PPO)", target, 0.0, evidence)
+    claim = "λ = 16: the kept clips are as after fine-tuning without an anti-reward"
+    yield from kept_stay(variants, ARFT, CONTROL, claim)
+    yield from samplers.findings(variants, f"{ARFT}, ")
+
+
+def answer(document: Document) -> str:
+    """The kept clips with arft and with each baseline, in one sentence."""
+    variants, parts = document["results"]["variants"], []
+    for method in PAPERS:
+        kept = mean_gained(variants, PLAIN_ARFT, plain(method), "kept", TRACKING)
+        if kept:
+            parts.append(f"{number(kept, 2)} ({method.replace('_', ' ')})")
+    return f"Tracking of the kept clips with arft minus that with each baseline: {'; '.join(parts)}."
+
+
 STUDY = Study(
     name="comparison",
     title="Every method at the same budget",
-    retrains=True,
+    claim="Anti-reward fine-tuning (arft) keeps the other clips better than the baselines do.",
     measure=measure,
-    tell=tell,
+    body=body,
     draw=lambda document: variant_bars(document["results"]["variants"]),
-    asks=[*METHODS, *ablation()],
+    findings=findings,
+    answer=answer,
+    asked=lambda lab: {
+        "values": [*METHODS, *samplers.ablation()],
+        "control_iterations": lab.control_iterations,
+    },
 )
 
 if __name__ == "__main__":

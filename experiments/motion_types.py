@@ -1,9 +1,9 @@
-"""Does it matter what is to be forgotten: combat, dance or locomotion? (paper, fig. 4)"""
+"""Does it matter which motions are to be forgotten? (paper, fig. 4); see `studies/targets.py`."""
 
 from __future__ import annotations
 
-from forgetmimic_jax.studies.study import main
-from forgetmimic_jax.sweep import targets_study
+from forgetmimic_jax.studies.conduct import main
+from forgetmimic_jax.studies.targets import targets_study
 
 STUDY = targets_study(name="motion_types")
 

@@ -1,11 +1,11 @@
-"""What does the penalty λ do, and where do the targets tip over? (paper, table 2; with 6, 7, 9 and 12 around W = 8)"""
+"""What does the penalty λ do? (paper, table 2; with 6, 7, 9 and 12 around W = 8); see `studies/penalty.py`."""
 
 from __future__ import annotations
 
-from forgetmimic_jax.studies.study import main
-from forgetmimic_jax.sweep import lambda_study
+from forgetmimic_jax.studies.conduct import main
+from forgetmimic_jax.studies.penalty import penalty_study
 
-STUDY = lambda_study(name="penalty")
+STUDY = penalty_study()
 
 if __name__ == "__main__":
     main(STUDY)

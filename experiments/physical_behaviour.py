@@ -1,18 +1,23 @@
-"""What does the robot do when it is asked for a forgotten clip? Six physical measures (paper, fig. 6)"""
+"""What does the robot do on a forgotten clip? Six physical measures (paper, fig. 6)"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from experiments.validity import LENGTH, NO_FURTHER_OFF, SOONER
 from forgetmimic_jax.evaluation import metrics, statistics
 from forgetmimic_jax.evaluation.plots import new_figure
+from forgetmimic_jax.evaluation.statistics import Estimate
 from forgetmimic_jax.evaluation.tables import UNITS, markdown_table, number
-from forgetmimic_jax.evaluation.variants import within
-from forgetmimic_jax.studies.study import Lab, Study, main, newest_policy
+from forgetmimic_jax.studies.claim import Finding, finding
+from forgetmimic_jax.studies.conduct import main
+from forgetmimic_jax.studies.lab import Lab, newest_policy
+from forgetmimic_jax.studies.study import Document, Study
+from forgetmimic_jax.studies.variants import DEVIATION, within
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -26,7 +31,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "λ = 8": {"penalty": 8.0},
     "λ = 16": {"penalty": 16.0},
 }
-MEASURES = ("episode_length", *ERRORS)
+MEASURES = (LENGTH, *ERRORS)
+UNLEARNED, ZERO = "λ = 16", "zero action"
 
 
 def measure(lab: Lab) -> dict[str, Any]:
@@ -35,7 +41,7 @@ def measure(lab: Lab) -> dict[str, Any]:
         {(label, seed): {**variant, "seed": seed} for label, variant in VARIANTS.items() for seed in lab.seeds},
         "physical behaviour",
     )
-    policies: dict[tuple[str, int], Path | None] = {("base", 0): lab.base, ("zero action", 0): None}
+    policies: dict[tuple[str, int], Path | None] = {("base", 0): lab.base, (ZERO, 0): None}
     policies |= {key: newest_policy(folder) for key, folder in runs.items()}
     rollouts, names = lab.rollouts(policies)
     common = metrics.common_length(rollouts.values())
@@ -48,18 +54,26 @@ def measure(lab: Lab) -> dict[str, Any]:
     return {"policies": result}
 
 
-def tell(document: Mapping[str, Any]) -> str:
+def over_runs(policies: Document, label: str, name: str) -> Estimate:
+    """A measure of a kind of policy, over its runs."""
+    return statistics.over_seeds([float(np.mean(run[name])) for run in policies[label].values()])
+
+
+def words(name: str) -> str:
+    """A measure for a reader."""
+    common = ", common steps" if name.endswith(metrics.COMMON) else ""
+    return f"{name.removesuffix(metrics.COMMON).replace('_', ' ')}{common}"
+
+
+def body(document: Document) -> str:
     """Means over the seeds, over the steps alive and over the steps that every policy survives."""
     policies = document["results"]["policies"]
     rows = []
     for name in (*MEASURES, *(name + metrics.COMMON for name in ERRORS)):
-        common = name.endswith(metrics.COMMON)
-        plain = name.removesuffix(metrics.COMMON)
-        label = f"{plain.replace('_', ' ')}, {UNITS.get(plain, 'm')}{', common steps' if common else ''}"
-        cells = [statistics.over_seeds([np.mean(run[name]) for run in of.values()]) for of in policies.values()]
-        largest = 1.0 if UNITS.get(plain) == "share" else np.inf
-        digits = 1 if name == "episode_length" else 3
-        rows.append([label, *(number(within(cell, 0.0, largest), digits) for cell in cells)])
+        unit = UNITS.get(name.removesuffix(metrics.COMMON), "m")
+        largest, digits = 1.0 if unit == "share" else np.inf, 1 if name == LENGTH else 3
+        cells = [number(within(over_runs(policies, label, name), 0.0, largest), digits) for label in policies]
+        rows.append([f"{words(name)}, {unit}", *cells])
     note = (
         "On the targets. Errors over the steps alive flatter a policy that falls at once; common steps are those that "
         "every policy survives. Paper (another library and budget): length 500 to 8-13 steps, anchor position error "
@@ -68,7 +82,36 @@ def tell(document: Mapping[str, Any]) -> str:
     return f"{markdown_table(['', *policies], rows)}\n{note}"
 
 
-def draw(document: Mapping[str, Any]) -> Figure:
+def findings(document: Document) -> Iterator[Finding]:
+    """Does the policy lack the skill, or does it end its episodes on purpose?"""
+    policies = document["results"]["policies"]
+    if UNLEARNED not in policies:
+        return
+    length, baseline = (over_runs(policies, label, LENGTH) for label in (UNLEARNED, ZERO))
+    evidence = f"target episodes last {number(length, 1)} steps; bound {baseline['mean'] - SOONER:.1f}, one less than "
+    claim = f"{UNLEARNED}: target episodes end no sooner than the zero-action baseline's"
+    bound = baseline["mean"] - SOONER
+    yield finding(claim, length, bound, f"{evidence}the zero-action baseline's", below=False, main=True)
+    kinds = (
+        (NO_FURTHER_OFF, DEVIATION, ZERO, True, True),
+        ("the feet touch the ground less often than the base's", "foot_contact", "base", True, False),
+        ("joints exceed their limits more often than the base's", "joint_limit_violation", "base", False, False),
+    )
+    for claim, name, other, below, is_main in kinds:
+        if name in next(iter(policies[other].values())):
+            found, theirs = over_runs(policies, UNLEARNED, name), over_runs(policies, other, name)["mean"]
+            evidence = f"{words(name)} {number(within(found, 0.0, np.inf), 3)}; bound {theirs:.3f}, the {other}'s"
+            yield finding(f"{UNLEARNED}: {claim}", found, theirs, evidence, below=below, main=is_main)
+
+
+def answer(document: Document) -> str:
+    """How long the robot follows a target, in one sentence."""
+    policies = document["results"]["policies"]
+    base, zero, unlearned = (number(over_runs(policies, label, LENGTH), 1) for label in ("base", ZERO, UNLEARNED))
+    return f"An episode of a target lasts {unlearned} steps; with the base {base}, with zero actions {zero}."
+
+
+def draw(document: Document) -> Figure:
     """A violin of all episodes for each measure and policy."""
     policies = document["results"]["policies"]
     figure = new_figure(width=11.0, height=6.0)
@@ -84,10 +127,13 @@ def draw(document: Mapping[str, Any]) -> Figure:
 
 STUDY = Study(
     name="physical_behaviour",
-    title="What does the robot do when it is asked for a forgotten clip?",
+    title="What does the robot do on a forgotten clip?",
+    claim="The robot fails at a forgotten clip because it lacks the skill, and does not act against it.",
     measure=measure,
-    tell=tell,
+    body=body,
     draw=draw,
+    findings=findings,
+    answer=answer,
 )
 
 if __name__ == "__main__":

@@ -1,14 +1,16 @@
-"""How fast does a forgotten motion come back, and how fast does one that was never there come? (paper, fig. 8)
+"""How fast does a forgotten motion come back, and how fast does one come that was never there? (paper, fig. 8)
 
-Plain fine-tuning on all clips, from the unlearned policy, from one that learned the kept clips from the base and never
-lived a target, from one retrained without the targets, and from scratch. If the unlearned policy needs far fewer target
-steps than those that never had them, the motion was hidden and not forgotten.
+Plain fine-tuning on all clips, from four starts: the unlearned policy, one that learned the kept clips from the base
+and was never trained on a target, one retrained without the targets, and a random one. If the unlearned policy needs
+far fewer target steps than those that were never trained on the targets, the motion was hidden and not forgotten.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,15 +18,20 @@ import msgspec
 import numpy as np
 
 from forgetmimic_jax.basics.files import read_rows
-from forgetmimic_jax.evaluation import paper, statistics
+from forgetmimic_jax.evaluation import statistics
 from forgetmimic_jax.evaluation.document import FILE, read_evaluation
 from forgetmimic_jax.evaluation.plots import new_figure
-from forgetmimic_jax.evaluation.relearning import Origin, Origins, at_first, comparable_settings, lasted
+from forgetmimic_jax.evaluation.relearning import Lasted, Origin, Origins, at_first, comparable_settings, lasted
 from forgetmimic_jax.evaluation.tables import markdown_table, number, percent
-from forgetmimic_jax.evaluation.variants import within
 from forgetmimic_jax.evaluation.verdict import retained, skills
 from forgetmimic_jax.settings.config import load_config
-from forgetmimic_jax.studies.study import ITERATIONS, Lab, Study, main, newest_policy
+from forgetmimic_jax.studies import paper
+from forgetmimic_jax.studies.claim import Between, Finding, finding_between
+from forgetmimic_jax.studies.conduct import main
+from forgetmimic_jax.studies.findings import share
+from forgetmimic_jax.studies.lab import Lab, newest_policy
+from forgetmimic_jax.studies.study import ITERATIONS, Document, Study
+from forgetmimic_jax.studies.variants import TRACKING, within
 from forgetmimic_jax.training.checkpoint import policy_hash
 from forgetmimic_jax.unlearning.method import FINE_TUNING, SHORT
 from forgetmimic_jax.unlearning.registry import method_of
@@ -34,47 +41,35 @@ if TYPE_CHECKING:
 
 EVALUATIONS = 20
 SHARES = (0.5, 0.8, 0.95)  # of the base's survival-weighted tracking on the targets
+MAIN_SHARE = 0.8
+CONTROLS = ("distilled", "retrained", "fresh")  # never trained on a target
+HEAD_START = 0.8  # of a level: a control that starts above that says little of how fast it is reached
 
 
 def measure(lab: Lab) -> dict[str, Any]:
     """First the policies to start from, then their relearning."""
-    given = {"iterations": ITERATIONS[lab.options.budget]}
-    asked: dict[tuple[str, int], dict[str, Any]] = {("unlearned", seed): {**given, "seed": seed} for seed in lab.seeds}
-    asked |= {("distilled", seed): {**given, "method": "distill", "seed": seed} for seed in lab.seeds}
+    length = {"iterations": ITERATIONS[lab.options.preset]}
+    asked: dict[tuple[str, int], dict[str, Any]] = {("unlearned", seed): {**length, "seed": seed} for seed in lab.seeds}
+    asked |= {("distilled", seed): {**length, "method": "distill", "seed": seed} for seed in lab.seeds}
     retrain = {"method": "retrain", "iterations": lab.control_iterations}
     asked |= {("retrained", seed): {**retrain, "seed": seed} for seed in lab.control_seeds}
     folders = lab.run(asked, "policies to relearn from")
     policies = {key: newest_policy(folder) for key, folder in folders.items()}
-    # A start's own settings would be its training's: all of them relearn at the same fixed pace and held by nothing. On
-    # a laptop the targets have as many of the starts as in unlearning: whoever wants them back would do the same.
-    on_laptop = lab.options.budget == "cpu"
-    pace = {**SHORT, "schedule": "fixed", "base_kl": 0.0} if on_laptop else {}
-    alike = [f"ppo.{name}={json.dumps(value)}" for name, value in pace.items()]
-    alike += ["wrench.max_gain=0.0", f"sampling.target_share={FINE_TUNING.target_share['cpu'] if on_laptop else 0.0}"]
-    watched = {"clips": "all", "set": [*lab.watched(EVALUATIONS), *alike]}
-    relearn: dict[tuple[str, int], dict[str, Any]] = {
-        (label, seed): {**watched, "method": "finetune", "base": policy, "seed": seed}
-        for (label, seed), policy in policies.items()
-    }
-    relearn |= {
-        ("fresh", seed): {**watched, "method": "retrain", "sampler": "uniform_clips", "seed": seed}
-        for seed in lab.seeds
-    }
-    relearned = lab.run(relearn, "relearning")
+    relearned = lab.run(relearning_runs(lab, policies), "relearning")
     base: dict[str, float] = {}
     curves: dict[str, Any] = {label: {} for label, _ in relearned}
     for seed in lab.seeds:
         starts = {label: policy for (label, of), policy in policies.items() if of == seed}
-        at_first = lab.as_watched({"base": lab.base, **starts}, seed)
-        base[str(seed)] = _tracking(at_first["base"], lab.targets)
+        first = lab.as_watched({"base": lab.base, **starts}, seed)
+        base[str(seed)] = _tracking(first["base"], lab.targets)
         for (label, of), folder in relearned.items():
             if of == seed:
-                curves[label][str(seed)] = curve_of(folder, lab.targets, at_first.get(label))
+                curves[label][str(seed)] = curve_of(folder, lab.targets, first.get(label))
     return {"base": base, "starts": curves, "origins": msgspec.to_builtins(origins(lab, folders))}
 
 
 def origins(lab: Lab, folders: Mapping[tuple[str, int], Path]) -> Origins:
-    """How the policies of each start were trained, so that a report can tell whether the curves belong to its run.
+    """How the policies of each start were trained, so that a report can see whether the curves belong to its run.
 
     Args:
         lab: of the study.
@@ -90,15 +85,35 @@ def origins(lab: Lab, folders: Mapping[tuple[str, int], Path]) -> Origins:
     return Origins(policy_hash(lab.info), starts)
 
 
+def relearning_runs(lab: Lab, policies: Mapping[tuple[str, int], Path]) -> dict[tuple[str, int], dict[str, Any]]:
+    """The options of each relearning run, by start and seed.
+
+    All of them have the same fixed step size and no KL to their start; settings of their own would be those that they
+    were trained with. On a laptop half of the starts are on the targets, as in unlearning: whoever wants the targets
+    back would do the same.
+    """
+    name = lab.options.preset
+    pace = {**SHORT, "schedule": "fixed", "base_kl": 0.0} if name == "cpu" else {}
+    alike = [f"ppo.{setting}={json.dumps(value)}" for setting, value in pace.items()]
+    alike += ["wrench.max_gain=0.0", f"sampling.target_share={FINE_TUNING.target_share.get(name, 0.0)}"]
+    watched = {"clips": "all", "set": [*lab.watched(EVALUATIONS), *alike]}
+    runs: dict[tuple[str, int], dict[str, Any]] = {
+        (label, seed): {**watched, "method": "finetune", "base": policy, "seed": seed}
+        for (label, seed), policy in policies.items()
+    }
+    fresh = {**watched, "method": "retrain", "sampler": "uniform_clips"}
+    return runs | {("fresh", seed): {**fresh, "seed": seed} for seed in lab.seeds}
+
+
 def _tracking(clips: Mapping[str, Mapping[str, float]], targets: tuple[str, ...]) -> float:
     """Survival-weighted tracking, mean of the targets."""
-    return float(np.mean([clips[target]["survival_weighted_tracking"] for target in targets]))
+    return float(np.mean([clips[target][TRACKING] for target in targets]))
 
 
 def curve_of(
     folder: Path, targets: tuple[str, ...], at_first: Mapping[str, Mapping[str, float]] | None
 ) -> dict[str, list[float]]:
-    """Tracking on the targets, and the target steps lived until then, at every evaluation of a relearning run.
+    """Tracking on the targets, and the target steps until then, at every evaluation of a relearning run.
 
     Args:
         folder: of the run.
@@ -106,8 +121,8 @@ def curve_of(
         at_first: the policy that the run started from, clip by clip, on the same episodes; None for a fresh one.
     """
     rows, log = (read_rows(folder / name) for name in ("evaluations.jsonl", "metrics.jsonl"))
-    lived = np.diff([0, *(row["environment_steps"] for row in log)]) * [row["target/step_share"] for row in log]
-    counted = ([0, *(row["iteration"] for row in log)], [0.0, *np.cumsum(lived)])
+    on_target = np.diff([0, *(row["environment_steps"] for row in log)]) * [row["target/step_share"] for row in log]
+    counted = ([0, *(row["iteration"] for row in log)], [0.0, *np.cumsum(on_target)])
     start = [] if at_first is None else [(0, _tracking(at_first, targets), 0.0)]
     points = [
         (row["iteration"], _tracking(row["clips"], targets), float(np.interp(row["iteration"], *counted)))
@@ -117,13 +132,13 @@ def curve_of(
     return {"iterations": list(iterations), "tracking": list(tracking), "target_steps": list(steps)}
 
 
-def tell(document: Mapping[str, Any]) -> str:
-    """Iterations and target steps until each share of the base, over the seeds that got there."""
+def body(document: Document) -> str:
+    """Iterations and target steps until each share of the base, over the seeds that reached it."""
     results = document["results"]
     rows = []
     for label in results["starts"]:
-        for share in SHARES:
-            found = lasted(results, label, share).values()
+        for level in SHARES:
+            found = lasted(results, label, level).values()
             reached = sum(run.there for run in found)
             cells = []
             for place in (0, 1):
@@ -131,23 +146,71 @@ def tell(document: Mapping[str, Any]) -> str:
                 cells.append(number(mean, 0) if reached == len(found) else f"more than {mean['mean']:,.0f}")
             before = list(at_first(results, label).values())
             first = percent(within(statistics.over_seeds(before), 0.0, np.inf)) if before else ""
-            rows.append([label, first, f"{100 * share:.0f} %", f"{reached} of {len(found)}", *cells])
+            rows.append([label, first, share(level), f"{reached} of {len(found)}", *cells])
     theirs = ", ".join(f"{iterations:,} for {clips}" for clips, iterations in paper.RELEARNING.items())
     note = (
-        f"At first and shares: of the base's survival-weighted tracking on the targets, "
-        f"{number(statistics.over_seeds(list(results['base'].values())))}, on the same episodes, reached at the first "
-        "of two evaluations in a row that are not below; more than: a run that never got there counts with its end. "
-        "Whatever the start, with the cpu budget relearning is held by no anchor and has half of its starts on the "
-        "targets. "
-        f"The retrained policy has had {document['asked']['control_iterations']:,} iterations: as little as that is a "
-        f"reference for the first steps only. The paper (another library and budget) took {theirs} until 95 % of its "
-        "tracking while alive, from its unlearned policy; it has no control.\n"
+        "At the start and shares: of the base's survival-weighted tracking on the targets, "
+        f"{number(statistics.over_seeds(list(results['base'].values())))}, on the same episodes. A share is reached at "
+        "the first of two evaluations in a row that are not below it. More than: a run that never reached it counts "
+        "with its end. No start is regularised towards a base, and with the cpu preset half of the starts are on the "
+        f"targets. The retrained policy was trained for {document['asked']['control_iterations']:,} iterations; a "
+        "short training makes it a reference for the first steps only. The paper (another library and budget) took "
+        f"{theirs} until 95 % of its tracking while alive, from its unlearned policy; it has no control.\n"
     )
-    header = ["start", "at first", "share of the base", "runs that reached it", "iterations", "target steps"]
+    header = ["start", "at the start", "share of the base", "runs that reached it", "iterations", "target steps"]
     return f"{markdown_table(header, rows)}\n{note}"
 
 
-def draw(document: Mapping[str, Any]) -> Figure:
+def findings(document: Document) -> Iterator[Finding]:
+    """Fig. 8, with the controls that the paper lacks."""
+    results = document["results"]
+    for control, level in itertools.product(CONTROLS, SHARES):
+        if {"unlearned", control} <= results["starts"].keys():
+            yield _no_sooner(results, control, level)
+
+
+def answer(document: Document) -> str:
+    """How much longer the unlearned policy needs, in one sentence."""
+    results, parts = document["results"], []
+    mine = lasted(results, "unlearned", MAIN_SHARE)
+    for control in CONTROLS:
+        theirs = lasted(results, control, MAIN_SHARE) if control in results["starts"] else {}
+        if theirs.keys() == mine.keys():
+            more = statistics.over_seeds([mine[seed].target_steps - theirs[seed].target_steps for seed in mine])
+            parts.append(f"{number(more, 0)} ({control})")
+    return (
+        f"Steps on the targets until {share(MAIN_SHARE)} of the base's tracking, of the unlearned policy minus of one "
+        f"that was never trained on them: {'; '.join(parts)}."
+    )
+
+
+def _no_sooner(results: Mapping[str, Any], control: str, level: float) -> Finding:
+    """The unlearned policy needs no fewer target steps than a control until a share `level` of the base."""
+    mine, theirs = (lasted(results, label, level) for label in ("unlearned", control))
+    both = [seed for seed in mine if seed in theirs]
+    claim = f"{share(level)} of the tracking comes back after no fewer target steps than a {control} policy needs"
+    more = statistics.over_seeds([mine[seed].target_steps - theirs[seed].target_steps for seed in both])
+    mean = float(np.mean([theirs[seed].target_steps for seed in both]))
+    evidence = f"target steps until {share(level)}, unlearned minus {control} {number(more, 0)}; bound 0"
+    evidence += f"; {control} {mean:,.0f}"
+    for label, of in (("unlearned", mine), (control, theirs)):
+        never = sum(not of[seed].there for seed in both)
+        evidence += f"; {label} never got there in {never} of {len(both)} runs" if never else ""
+    head_start = float(np.mean([at_first(results, control).get(seed, 0.0) for seed in both]))
+    if head_start >= HEAD_START * level:
+        return Finding(claim, "the control starts near it", f"{evidence}, and starts at {share(head_start)}", len(both))
+    differences = [more_steps(mine[seed], theirs[seed]) for seed in both]
+    main = level == MAIN_SHARE and len(both) == len(mine)
+    return finding_between(claim, differences, 0.0, evidence, below=False, main=main)
+
+
+def more_steps(unlearned: Lasted, control: Lasted) -> Between:
+    """How many more target steps the unlearned policy needed than a control: a run that never got there needs more."""
+    difference = unlearned.target_steps - control.target_steps
+    return Between(difference if control.there else -math.inf, difference if unlearned.there else math.inf)
+
+
+def draw(document: Document) -> Figure:
     """Tracking on the targets over iterations and over target steps."""
     base = float(np.mean(list(document["results"]["base"].values())))
     figure = new_figure(width=10.0, height=4.0)
@@ -156,8 +219,8 @@ def draw(document: Mapping[str, Any]) -> Figure:
         for colour, (label, runs) in enumerate(document["results"]["starts"].items()):
             for number_, curve in enumerate(runs.values()):
                 axes.plot(curve[x], curve["tracking"], color=f"C{colour}", label="" if number_ else label)
-        for share in SHARES:
-            axes.axhline(share * base, color="0.7", linestyle=":")
+        for level in SHARES:
+            axes.axhline(level * base, color="0.7", linestyle=":")
         axes.set_xlabel(x.replace("_", " "))
         axes.locator_params(axis="x", nbins=6)
         axes.set_ylabel("survival-weighted tracking on the targets")
@@ -168,12 +231,15 @@ def draw(document: Mapping[str, Any]) -> Figure:
 STUDY = Study(
     name="relearning",
     title="How fast does a forgotten motion come back?",
+    claim="A forgotten motion comes back no faster than one that was never learned.",
     iterations={"cpu": 300, "paper": 10_000},
-    retrains=True,
     watches=True,
     measure=measure,
-    tell=tell,
+    body=body,
     draw=draw,
+    findings=findings,
+    answer=answer,
+    asked=lambda lab: {"control_iterations": lab.control_iterations},
 )
 
 if __name__ == "__main__":

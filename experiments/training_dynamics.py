@@ -1,22 +1,27 @@
-"""Two configurations on their way: A with λ = 2, adaptive sampling and the wrench, B with λ = 8 (paper, fig. 7)"""
+"""Two configurations during training: A with λ = 2, adaptive sampling and the wrench, B with λ = 8 (paper, fig. 7)"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from forgetmimic_jax.basics.files import read_rows
 from forgetmimic_jax.evaluation.plots import new_figure
-from forgetmimic_jax.evaluation.tables import markdown_table, number
-from forgetmimic_jax.evaluation.variants import over_seeds
-from forgetmimic_jax.studies.study import Lab, Study, main
+from forgetmimic_jax.evaluation.statistics import Estimate
+from forgetmimic_jax.evaluation.tables import FORGOTTEN, markdown_table, number
+from forgetmimic_jax.studies.claim import Finding, finding
+from forgetmimic_jax.studies.conduct import main
+from forgetmimic_jax.studies.lab import Lab
+from forgetmimic_jax.studies.study import Document, Study
+from forgetmimic_jax.studies.variants import over_seeds
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+A, B = "A: λ = 2, adaptive, wrench", "B: λ = 8"
 CONFIGURATIONS: dict[str, dict[str, Any]] = {
-    "A: λ = 2, adaptive, wrench": {"penalty": 2.0, "sampler": "adaptive", "wrench": True},
-    "B: λ = 8": {"penalty": 8.0},
+    A: {"penalty": 2.0, "sampler": "adaptive", "wrench": True},
+    B: {"penalty": 8.0},
 }
 CURVES = (
     *("target/R_anti", "target/tracking_reward", "kept/tracking_reward", "target/lambda_crit", "entropy"),
@@ -42,44 +47,86 @@ def measure(lab: Lab) -> dict[str, Any]:
         folders = [folder for (of, _), folder in runs.items() if of == label]
         logs = [{row["iteration"]: row for row in read_rows(folder / "metrics.jsonl")} for folder in folders]
         if logs:
-            # A run that was stopped and went on has a row more, at the iteration where it was stopped.
+            # A run that was stopped and resumed has one row more, at the iteration where it was stopped.
             common = sorted(set(logs[0]).intersection(*logs))
-            rows = [over_seeds([{name: log[at][name] for name in CURVES} for log in logs]) for at in common]
+            rows = [over_seeds([{name: log[at][name] for name in CURVES if name in log[at]} for log in logs])
+                    for at in common]  # fmt: skip
             result[label] = {"iterations": common, "rows": rows}
     return {"configurations": result}
 
 
-def tell(document: Mapping[str, Any]) -> str:
+def body(document: Document) -> str:
     """Each curve's first and last value."""
     configurations = document["results"]["configurations"]
     header = ["", *(f"{label}, {when}" for label in configurations for when in ("first", "last"))]
     header += [f"paper's {label.partition(':')[0]}, first and last" for label in CONFIGURATIONS]
     rows = [
         [name.replace("_", " ")]
-        + [number(of["rows"][place][name]) for of in configurations.values() for place in (0, -1)]
+        + [number(of["rows"][place].get(name)) for of in configurations.values() for place in (0, -1)]
         + list(THEIRS.get(name, ("", "")))
         for name in CURVES
     ]
     note = (
         "R_anti here is a mean over target steps, the paper's over all steps; its numbers are of another library. "
-        "Episode length is of the episodes that ended, and all environments start anew with the run: the first value "
-        "is of those that fell at once. With the cpu budget B gives the targets half of the starts, A leaves them the "
-        "share of its sampler.\n"
+        "Episode length is of the episodes that ended. All environments start anew with the run, so the first value is "
+        "of those that fell at once. With the cpu preset B takes half of the starts from the targets, A the share that "
+        "its sampler gives them.\n"
     )
     return f"{markdown_table(header, rows)}\n{note}"
 
 
-def draw(document: Mapping[str, Any]) -> Figure:
+def findings(document: Document) -> Iterator[Finding]:
+    """What the paper reads off its curves, last value against first."""
+    configurations = document["results"]["configurations"]
+    claims = [(A, "entropy", False, True), (B, "entropy", True, True)]
+    claims += [(A, name, True, False) for name in ("wrench_gain", "top_bin_probability")]
+    for label, name, rises, is_main in claims:
+        if label in configurations:
+            rows = configurations[label]["rows"]
+            first, last = rows[0][name], rows[-1][name]
+            evidence = (
+                f"{name.replace('_', ' ')} of {label.partition(':')[0]} {number(last, 3)} after {first['mean']:.3f}"
+            )
+            claim = f"{label}: {name.replace('_', ' ')} {'rises' if rises else 'falls'}"
+            yield finding(claim, difference(last, first), 0.0, evidence, below=not rises, main=is_main)
+    if B in configurations:
+        first, last = (configurations[B]["rows"][place]["target/R_anti"] for place in (0, -1))
+        bound = FORGOTTEN * first["mean"]
+        evidence = f"R_anti a target step {number(last, 2)}; bound {bound:.2f}, a fifth of the first"
+        yield finding(f"{B}: the targets' anti-reward goes to nothing", last, bound, evidence, below=False)
+
+
+def answer(document: Document) -> str:
+    """Entropy at the start and at the end, in one sentence."""
+    parts = []
+    for label, of in document["results"]["configurations"].items():
+        first, last = (of["rows"][place]["entropy"] for place in (0, -1))
+        parts.append(f"from {first['mean']:.2f} to {number(last, 2)} ({label.partition(':')[2].strip()})")
+    return f"Entropy goes {'; '.join(parts)}."
+
+
+def difference(last: Estimate, first: Estimate) -> Estimate:
+    """Of two estimates whose seeds are not known one by one: as wide as both intervals together."""
+    result: Estimate = {"mean": last["mean"] - first["mean"], "n": last["n"]}
+    if "low" in last and "low" in first:
+        ends: Estimate = {"low": last["low"] - first["high"], "high": last["high"] - first["low"]}
+        result |= {**ends, "std": last["std"] + first["std"]}
+    return result
+
+
+def draw(document: Document) -> Figure:
     """One panel a curve, with its interval as a band."""
     figure = new_figure(width=11.0, height=7.5)
     for place, name in enumerate(CURVES):
         axes = figure.add_subplot(3, 3, place + 1)
         for label, of in document["results"]["configurations"].items():
-            estimates = [row[name] for row in of["rows"]]
-            means = [estimate["mean"] for estimate in estimates]
-            (line,) = axes.plot(of["iterations"], means, label=label)
-            low, high = ([estimate.get(end, estimate["mean"]) for estimate in estimates] for end in ("low", "high"))
-            axes.fill_between(of["iterations"], low, high, color=line.get_color(), alpha=0.2, linewidth=0)
+            points = [(at, row[name]) for at, row in zip(of["iterations"], of["rows"], strict=True) if name in row]
+            iterations = [at for at, _ in points]
+            means, low, high = (
+                [estimate.get(end, estimate["mean"]) for _, estimate in points] for end in ("mean", "low", "high")
+            )
+            (line,) = axes.plot(iterations, means, label=label)
+            axes.fill_between(iterations, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
         axes.set_title(name.replace("_", " "), fontsize="medium")
         axes.set_xlabel("iterations", fontsize="small")
     figure.axes[0].legend(frameon=False, fontsize="small")
@@ -88,10 +135,13 @@ def draw(document: Mapping[str, Any]) -> Figure:
 
 STUDY = Study(
     name="training_dynamics",
-    title="Two configurations on their way",
+    title="Two configurations during training",
+    claim="Entropy rises where the policy forgets (λ = 8) and falls where it does not (λ = 2).",
     measure=measure,
-    tell=tell,
+    body=body,
     draw=draw,
+    findings=findings,
+    answer=answer,
 )
 
 if __name__ == "__main__":

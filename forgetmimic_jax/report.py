@@ -89,11 +89,11 @@ def main(options: Options) -> None:
 
 def _commands(options: Options, subject: Subject) -> list[str]:
     """What makes the run, and this page, again."""
-    from forgetmimic_jax import unlearn
     from forgetmimic_jax.reporting.reproduce import flags_of, settings_changed, words
+    from forgetmimic_jax.training import unlearning_run
 
     flags = flags_of(subject, options.base)
-    changed = settings_changed(subject.info.config, unlearn.config_of_new_run(unlearn.Options(**flags)))
+    changed = settings_changed(subject.info.config, unlearning_run.config_of_new_run(unlearning_run.Options(**flags)))
     comparisons = {name: getattr(options, name) for name in ("base", "control", "relearning")}
     return [
         f"forgetmimic unlearn {words(flags, changed)} --output {options.run}",

@@ -1,8 +1,9 @@
-"""What a number was made with: the code's commit, the versions that decide it, and the machine."""
+"""What a number was made with: the code and its commit, the versions that decide it, and the machine."""
 
 from __future__ import annotations
 
 import functools
+import hashlib
 import os
 import platform
 import subprocess
@@ -19,7 +20,9 @@ CHANGED = "+changes"
 class Provenance:
     """Where a number comes from; it goes into every JSON of results."""
 
+    code: str  # content of the code; see `code_hash`
     commit: str  # of the code; see `commit`
+    python: str
     jax: str
     mujoco: str
     processor: str
@@ -29,7 +32,24 @@ class Provenance:
 @functools.cache
 def provenance() -> Provenance:
     """Of this process. It is found once: a checkout that changes later does not change the code that is loaded."""
-    return Provenance(commit(PACKAGE), installed("jax"), installed("mujoco"), processor(), cores())
+    return Provenance(
+        code=code_hash(PACKAGE),
+        commit=commit(PACKAGE),
+        python=platform.python_version(),
+        jax=installed("jax"),
+        mujoco=installed("mujoco"),
+        processor=processor(),
+        cores=cores(),
+    )
+
+
+def code_hash(package: Path) -> str:
+    """Content hash (8 hex digits) of every Python file below a folder; what a commit changes elsewhere keeps it."""
+    content = hashlib.sha256()
+    for path in sorted(package.rglob("*.py")):
+        file = path.read_bytes()
+        content.update(f"{path.relative_to(package).as_posix()}:{len(file)}:".encode() + file)
+    return content.hexdigest()[:8]
 
 
 def commit(package: Path) -> str:

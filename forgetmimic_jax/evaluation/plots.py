@@ -1,11 +1,12 @@
 """Figures of evaluation.json, metrics.jsonl and studies. matplotlib is loaded only when a figure is drawn.
 
-`path` is where a figure goes: a file, whose suffix says the format, or a text buffer, which gets SVG.
+`path` is where a figure goes: a PNG file, or a text buffer, which gets SVG.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from math import nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -107,7 +108,7 @@ def unlearning_curves(rows: Sequence[Mapping[str, Any]], path: Path | TextIO, *,
     for panel, (key, title) in enumerate(panels.items()):
         axes = figure.add_subplot(1, len(panels), panel + 1)
         for group in ("target", "kept"):
-            axes.plot(steps, [row[f"{group}/{key}"] for row in rows], label=group, color=GROUP_COLOURS[group])
+            axes.plot(steps, [row.get(f"{group}/{key}", nan) for row in rows], label=group, color=GROUP_COLOURS[group])
         if key == "lambda_crit" and penalty is not None:
             axes.axhline(penalty, color="0.4", linestyle="--", label="λ")
         axes.set_title(title, fontsize="medium")
@@ -180,13 +181,12 @@ def new_figure(*, width: float, height: float) -> Figure:
 
 
 def save(figure: Figure, path: Path | TextIO) -> None:
-    """Write a figure as its path's ending says; an SVG of the same figure is the same file."""
+    """Write a figure as PNG to a path, or as SVG to a text buffer."""
     import matplotlib
 
     if isinstance(path, Path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with matplotlib.rc_context({"svg.hashsalt": path.stem}):
-            figure.savefig(path, dpi=150, metadata={"Date": None} if path.suffix == ".svg" else None)
+        figure.savefig(path, dpi=150)
         return
     # In a page: text stays text, in the page's own font.
     with matplotlib.rc_context({"svg.hashsalt": "page", "svg.fonttype": "none", "font.family": "sans-serif"}):

@@ -20,6 +20,7 @@ class Estimate(TypedDict, total=False):
     """A mean and its 95 % interval. A number that is undefined is absent: JSON has no NaN.
 
     `std` is the standard deviation over the n units; for a ratio, which no single unit has, that of the bootstrap.
+    `episodes` is there where the interval is the exact one of a rate over the episodes of all units together.
     """
 
     mean: float
@@ -27,6 +28,7 @@ class Estimate(TypedDict, total=False):
     high: float
     std: float
     n: int
+    episodes: int
 
 
 def estimate(mean: float, low: float, high: float, std: float, n: int) -> Estimate:

@@ -1,4 +1,4 @@
-"""Many unlearning runs that differ in one thing, and one JSON of what came out. The studies are in `experiments/`.
+"""Many unlearning runs that differ in one thing: trials, one JSON, a page with its claims, and a figure.
 
-A single run is in `training`.
+The ten studies of the paper are in `experiments/`, a file each; a single run is in `training`.
 """

@@ -1,13 +1,16 @@
 """Many unlearning runs: each a process of its own, so that one that fails or is stopped harms no other.
 
-A trial's folder is named by what it was asked for, so a finished one is found again, by any study that asks the same.
+A trial is a Config and its hash: its folder is named by what decides its numbers, so that any study that asks for the
+same run finds a finished one again, and a run of other code is another trial.
 """
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import fcntl
 import hashlib
+import itertools
 import json
 import shutil
 import signal
@@ -21,15 +24,20 @@ from typing import IO, Any
 
 from rich.console import Console
 
-from forgetmimic_jax import unlearn
 from forgetmimic_jax.basics.console import progress
 from forgetmimic_jax.basics.errors import Interrupted
 from forgetmimic_jax.basics.files import read_rows
+from forgetmimic_jax.basics.provenance import provenance
+from forgetmimic_jax.motion.library import library_hash
+from forgetmimic_jax.robot.model import roles_file
+from forgetmimic_jax.settings.config import Config, to_dict
+from forgetmimic_jax.tracking.setup import library_folder
 from forgetmimic_jax.training import checkpoint
 from forgetmimic_jax.training.checkpoint import newest_checkpoint
+from forgetmimic_jax.training.start import base_checkpoint
+from forgetmimic_jax.training.unlearning_run import Options, config_of
 
 POLL = 1.0  # s between two looks at the running trials
-DEFAULTS = {option.name: option.default for option in fields(unlearn.Options)}
 
 
 @dataclass(frozen=True)
@@ -38,17 +46,22 @@ class Trial:
 
     Args:
         folder: where it goes; see `make_trial`.
-        flags: of the command, all but `--output` and `--resume`.
-        iterations: how long it trains.
+        config: every setting.
+        flags: of the command that makes this config, all but `--output` and `--resume`.
     """
 
     folder: Path
+    config: Config
     flags: tuple[str, ...]
-    iterations: int
+
+    @property
+    def iterations(self) -> int:
+        """How long it trains."""
+        return self.config.iterations
 
     @property
     def evaluation(self) -> Path:
-        """The last thing a trial writes: where it is, the trial is finished."""
+        """The last file that a trial writes: with it, the trial is finished."""
         return self.folder / "evaluation.json"
 
     @property
@@ -58,28 +71,46 @@ class Trial:
 
 
 def make_trial(root: Path, options: Mapping[str, Any]) -> Trial:
-    """The trial of the options of `unlearn` by name; needs `base` and `iterations`.
+    """The trial with these options of `unlearn`, by name.
 
-    Its folder's name ends with a digest of all that is not a default and of the base's content. What the code does with
-    them is not part of it: after a change of the code, remove the folder.
+    Its folder is METHOD-TARGETS-sSEED-DIGEST-CODE in `root`. DIGEST is over every setting, the number of evaluation
+    episodes, and the contents of base, clips and robot; CODE is over the package's Python files. Where base and clips
+    lie does not count.
     """
-    asked = {name: value for name, value in options.items() if value != DEFAULTS[name]}
-    content = json.dumps({**asked, "base": checkpoint.fingerprint(Path(options["base"]))}, sort_keys=True, default=str)
-    digest = hashlib.sha256(content.encode()).hexdigest()[:8]
-    shown = ("penalty", "sampler", "wrench", "clips", "targets")
-    words = [str(options.get("method", "arft")), *(f"{name}_{asked[name]}" for name in shown if name in asked)]
-    name = "-".join([*words, f"s{options.get('seed', 0)}", digest]).replace(",", "+")
+    given = Options(**{**options, "set": [list(options.get("set", []))]})
+    config = config_of(given)
+    base = checkpoint.fingerprint(base_checkpoint(config))
+    robot = [path.read_text() for path in sorted(roles_file(config.robot).parent.glob("*.*ml"))]
+    plain = dataclasses.replace(config, base=None, library=None)
+    content = [to_dict(plain), given.episodes, base, library_hash(library_folder(config)), robot]
+    digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:8]
+    unlearning = config.unlearn
+    words = [unlearning.method, "+".join(unlearning.targets), f"s{config.seed}", digest, provenance().code]
+    return Trial(root / "-".join(words), config, flags_of(given))
+
+
+def without_code(name: str) -> str:
+    """A trial's name but for the code that made it."""
+    return name.rpartition("-")[0]
+
+
+def flags_of(options: Options) -> tuple[str, ...]:
+    """The command line of options that are not the defaults."""
     flags: list[str] = []
-    for option, value in asked.items():
-        values = value if isinstance(value, list | tuple) else [] if value is True else [value]
-        flags += [f"--{option}", *map(str, values)]
-    return Trial(root / name, tuple(flags), int(options["iterations"]))
+    for option in fields(options):
+        value, default = getattr(options, option.name), getattr(Options(), option.name)
+        if option.name == "set":
+            value, default = list(itertools.chain(*value)), []
+        if value != default:
+            values = value if isinstance(value, list) else [] if value is True else [value]
+            flags += [f"--{option.name}", *map(str, values)]
+    return tuple(flags)
 
 
 def run_trials(trials: Sequence[Trial], *, jobs: int, description: str) -> dict[Trial, str]:
-    """Run the trials that are not finished, `jobs` at a time; those that failed, each with its last words.
+    """Run the trials that are not finished, `jobs` at a time; returns those that failed, each with its last line.
 
-    A trial that was stopped goes on from its last checkpoint. Ctrl-C and SIGTERM stop the running ones, which save.
+    A trial that was stopped continues from its last checkpoint. Ctrl-C and SIGTERM stop the running ones, which save.
 
     Raises:
         Interrupted: stopped.
@@ -94,7 +125,7 @@ def run_trials(trials: Sequence[Trial], *, jobs: int, description: str) -> dict[
         rows = read_rows(trial.folder / "metrics.jsonl")
         return rows[-1]["iteration"] if rows else 0
 
-    def told(text: str) -> None:
+    def say(text: str) -> None:
         console.print(text, highlight=False, markup=False, soft_wrap=True)
 
     total, done = (sum(map(count, trials)) for count in (lambda trial: trial.iterations, iterations))
@@ -106,16 +137,16 @@ def run_trials(trials: Sequence[Trial], *, jobs: int, description: str) -> dict[
                 try:
                     running[trial] = _start(trial)
                 except BlockingIOError:
-                    failed[trial] = "another process is at work on it"
+                    failed[trial] = "another process runs it"
             time.sleep(POLL)
             for trial in [trial for trial, process in running.items() if process.poll() is not None]:
                 code = running.pop(trial).returncode
                 if code != 0 or not trial.evaluation.is_file():
-                    words = trial.log.read_text().strip().splitlines() or ["it said nothing"]
+                    words = trial.log.read_text().strip().splitlines() or ["it printed nothing"]
                     failed[trial] = f"killed by signal {-code}" if code < 0 else words[-1].removeprefix("error: ")
-                    told(f"failed: {trial.folder.name}: {failed[trial]} ({trial.log})")
+                    say(f"failed: {trial.folder.name}: {failed[trial]} ({trial.log})")
                 else:
-                    told(f"finished: {trial.folder.name}")
+                    say(f"finished: {trial.folder.name}")
             now = {trial.folder.name: iterations(trial) for trial in running}
             if now != shown:
                 report(sum(map(iterations, trials)), 0, shown := now)
@@ -123,15 +154,15 @@ def run_trials(trials: Sequence[Trial], *, jobs: int, description: str) -> dict[
 
 
 def _start(trial: Trial) -> subprocess.Popen:
-    """The trial's process, which holds a lock on its log as long as it lives, though its parent be killed."""
+    """The trial's process. It holds a lock on its log until it ends, even if its parent is killed."""
     trial.folder.parent.mkdir(parents=True, exist_ok=True)
     with trial.log.open("a") as log:
         _lock(log)
         resume = newest_checkpoint(trial.folder) is not None
         if not resume:
-            shutil.rmtree(trial.folder, ignore_errors=True)  # nothing in it to go on with
+            shutil.rmtree(trial.folder, ignore_errors=True)  # nothing in it to continue with
         command = [sys.executable, "-m", "forgetmimic_jax.unlearn", *trial.flags, "--output", str(trial.folder)]
-        # Its own session: a Ctrl-C in the terminal is for the parent, which asks each trial once to stop.
+        # Its own session: a Ctrl-C in the terminal reaches the parent alone, which asks each trial once to stop.
         return subprocess.Popen(
             command + ["--resume"] * resume, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
         )
@@ -143,7 +174,7 @@ def _lock(file: IO[str]) -> None:
 
 @contextlib.contextmanager
 def _stoppable(running: Mapping[Trial, subprocess.Popen]) -> Iterator[None]:
-    """Whatever ends the body early ends the running trials too, once they have saved; SIGTERM counts as Ctrl-C."""
+    """Whatever ends the body early also stops the running trials, which save first; SIGTERM counts as Ctrl-C."""
 
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
@@ -152,7 +183,7 @@ def _stoppable(running: Mapping[Trial, subprocess.Popen]) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        raise Interrupted("stopped; what is finished is kept; the same command goes on") from None
+        raise Interrupted("stopped; finished trials are kept; the same command continues") from None
     finally:
         for process in running.values():
             process.terminate()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from tensorboardX.proto.event_pb2 import Event, SessionLog
 from tensorboardX.proto.summary_pb2 import Summary
 
 from forgetmimic_jax.basics.files import drop_rows_after
+from forgetmimic_jax.ppo.threshold import GROUPS
 
 Metrics = Mapping[str, np.ndarray]
 
@@ -49,9 +50,10 @@ class Log:
         rows, self._rows = self._rows, []
         if not rows:
             return
-        mean = {name: np.mean([row[name] for row in rows], axis=0) for name in rows[0]}
+        mean = {name: _mean(name, [row[name] for row in rows]) for name in rows[0]}
         out: dict[str, Any] = {"iteration": iteration, "environment_steps": environment_steps}
-        out |= {name: float(value) for name, value in mean.items() if np.ndim(value) == 0}
+        absent = {name for name, value in mean.items() if _of_group(name) and np.isnan(value)}
+        out |= {name: float(value) for name, value in mean.items() if np.ndim(value) == 0 and name not in absent}
         now = time.monotonic()
         out["seconds"], self._last_row = round(now - self._last_row, 2), now
         out["clips"] = clip_rows(mean, clips)
@@ -66,6 +68,17 @@ class Log:
     def _write_event(self, step: int, **content: Any) -> None:
         self._events.write_event(Event(wall_time=time.time(), step=step, **content))
         self._events.flush()
+
+
+def _of_group(name: str) -> bool:
+    """Whether a metric is of the target or of the kept steps, and so NaN in an iteration without such a step."""
+    return name.partition("/")[0] in GROUPS
+
+
+def _mean(name: str, values: Sequence[np.ndarray]) -> np.ndarray:
+    """Mean over iterations; of a group's metric over those that have it, NaN where none has."""
+    measured = [value for value in values if not np.isnan(value)] if _of_group(name) else values
+    return np.mean(measured, axis=0) if measured else np.array(np.nan)
 
 
 def clip_rows(mean: Mapping[str, Any], clips: tuple[str, ...]) -> dict[str, dict[str, float]]:

@@ -119,5 +119,6 @@ LIVE = {
 
 
 def _live(metrics: Mapping[str, np.ndarray]) -> dict[str, float]:
-    """The metrics of an iteration that the terminal shows."""
-    return {label: float(metrics[name]) for name, label in LIVE.items() if name in metrics}
+    """The metrics of an iteration that the terminal shows; a group without a step in it has none."""
+    shown = {label: float(metrics[name]) for name, label in LIVE.items() if name in metrics}
+    return {label: value for label, value in shown.items() if not np.isnan(value)}

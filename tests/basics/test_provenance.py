@@ -1,4 +1,6 @@
 import os
+import platform
+import re
 import subprocess
 from importlib.metadata import version
 from pathlib import Path
@@ -8,7 +10,7 @@ import mujoco
 import pytest
 
 from forgetmimic_jax.basics import provenance as module
-from forgetmimic_jax.basics.provenance import commit, provenance
+from forgetmimic_jax.basics.provenance import PACKAGE, code_hash, commit, provenance
 
 
 def git(folder: Path, *arguments: str) -> str:
@@ -71,9 +73,27 @@ def test_a_repository_without_a_commit_gives_the_version(tmp_path):
     assert commit(package) == version("forgetmimic-jax")
 
 
+def test_the_code_is_the_content_of_its_python_files(package):
+    before = code_hash(package)
+    assert re.fullmatch("[0-9a-f]{8}", before)
+    (package / "page.html").write_text("<p>")
+    (package.parent / "experiments" / "a.py").write_text("new")
+    git(package.parent, "commit", "--quiet", "--all", "--message", "other files")
+    assert code_hash(package) == before
+    found = {before}
+    for name, text in (("__init__.py", "new\n"), ("inner/a.py", ""), ("inner/b.py", "")):
+        (package / name).parent.mkdir(exist_ok=True)
+        (package / name).write_text(text)
+        found.add(code_hash(package))
+    (package / "inner" / "b.py").rename(package / "inner" / "c.py")
+    found.add(code_hash(package))
+    assert len(found) == 5
+
+
 def test_this_process(monkeypatch):
     found = provenance()
     assert (found.jax, found.mujoco) == (jax.__version__, mujoco.__version__)
+    assert (found.python, found.code) == (platform.python_version(), code_hash(PACKAGE))
     assert found.processor
     assert 1 <= found.cores <= os.cpu_count()
     if hasattr(os, "sched_getaffinity"):

@@ -15,6 +15,7 @@ from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.settings.options import override
 from forgetmimic_jax.tracking.setup import make_setup
 from forgetmimic_jax.training import checkpoint
+from forgetmimic_jax.training.unlearning_run import config_of_new_run
 
 RSL_RL = Path(__file__).parents[1] / "exchange" / "rsl_rl" / "rsl_rl_5.5.1.pt"
 
@@ -42,12 +43,12 @@ def test_the_checkpoint_acts_as_rsl_rl_did(imported_run):
 def test_how_long_to_retrain_it_has_to_be_said(imported_run):
     asked = {"base": imported_run.folder, "targets": "turn", "method": "retrain"}
     with pytest.raises(InputError, match=r"--iterations: .* does not say how long it was trained"):
-        unlearn.config_of_new_run(unlearn.Options(**asked))
-    assert unlearn.config_of_new_run(unlearn.Options(**asked, iterations=3)).unlearn.method == "retrain"
+        config_of_new_run(unlearn.Options(**asked))
+    assert config_of_new_run(unlearn.Options(**asked, iterations=3)).unlearn.method == "retrain"
 
 
 def test_unlearning_starts_from_it(imported_run):
-    config = unlearn.config_of_new_run(unlearn.Options(base=imported_run.folder, targets="turn"))
+    config = config_of_new_run(unlearn.Options(base=imported_run.folder, targets="turn"))
     small = [setting for setting in TINY if "layers" not in setting and "bin_seconds" not in setting]
     setup = make_setup(override(config, small))
     start = started(setup)

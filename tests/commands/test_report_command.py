@@ -20,6 +20,7 @@ from forgetmimic_jax.reporting import films
 from forgetmimic_jax.settings.config import load_config
 from forgetmimic_jax.settings.options import override, parse
 from forgetmimic_jax.training.checkpoint import policy_hash, read_info
+from forgetmimic_jax.training.unlearning_run import config_of_new_run
 from forgetmimic_jax.viewing import film, offscreen
 
 FILM = [np.full((48, 64, 3), grey, np.uint8) for grey in (0, 128, 255)]
@@ -104,6 +105,23 @@ def test_the_page_tells_what_was_asked_done_and_found(page, run, base_run):
     assert "certif" not in page.lower()
 
 
+def test_a_threshold_that_was_not_measured_is_not_shown(run, tmp_path):
+    copy = Path(shutil.copytree(run, tmp_path / "run"))
+    rows = [json.loads(row) for row in (copy / "metrics.jsonl").read_text().splitlines()]
+    first, *others = [{name: row[name] for name in row if name != "target/lambda_crit"} for row in rows]
+    log = [first, *({**row, "target/lambda_crit": 7.5} for row in others)]
+    shown = []
+    for rows in (log, [first]):
+        (copy / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+        finished(report.main, report.Options(run=copy, films=0, output=copy / "report.html"))
+        facts = json.loads((copy / "report.json").read_text())
+        cards = {card["what"]: card["value"] for card in facts["cards"]}
+        shown.append((cards.get("λ_crit on the targets"), "7.5 on average" in facts["threshold"]))
+    assert shown == [("7.5", True), (None, False)]
+    assert facts["threshold"] == ""
+    assert (copy / "report.html").read_text().count("<svg") == 3  # the curves are there, without it
+
+
 def test_the_tables_are_those_of_the_evaluation(page, run):
     document = json.loads((run / "evaluation.json").read_text())
     mean = document["policies"]["unlearned"]["clips"]["turn"]["survival_weighted_tracking"]["mean"]
@@ -123,7 +141,7 @@ def test_the_command_that_reproduces_it_gives_the_runs_settings(facts, run):
     words = command.split()
     assert words[:2] == ["forgetmimic", "unlearn"]
     options = parse(unlearn.Options, "unlearn", words[2:])
-    config = override(unlearn.config_of_new_run(options), [setting for group in options.set for setting in group])
+    config = override(config_of_new_run(options), [setting for group in options.set for setting in group])
     assert dataclasses.replace(config, iterations=options.iterations) == load_config(run / "config.yaml")
     assert page == f"forgetmimic report --run {run}"
 

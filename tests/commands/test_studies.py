@@ -1,5 +1,6 @@
 """Sweeps and studies in miniature. Trials run in this process, where the miniature's iteration is compiled already."""
 
+import dataclasses
 import importlib
 import json
 import shutil
@@ -13,8 +14,11 @@ from scipy import stats
 
 from forgetmimic_jax import sweep, unlearn
 from forgetmimic_jax.basics.errors import InputError, Interrupted
+from forgetmimic_jax.basics.provenance import provenance
 from forgetmimic_jax.settings.options import parse
-from forgetmimic_jax.studies import study, trials
+from forgetmimic_jax.studies import conduct, lab, trials
+from forgetmimic_jax.studies.targets import targets_study
+from forgetmimic_jax.studies.variants import estimates
 
 STUDIES = (
     *("validity", "comparison", "penalty", "heat_map", "motion_types", "physical_behaviour", "training_dynamics"),
@@ -64,15 +68,16 @@ def swept(base_run, tmp_path_factory) -> tuple[Path, str]:
 
 def test_a_sweep_writes_numbers_page_and_figure(swept):
     folder, printed = swept
-    assert sorted(path.name for path in (folder / "out").iterdir()) == [
-        *("seeds.json", "seeds.md", "seeds.png", "seeds.svg"),
-    ]
+    assert sorted(path.name for path in (folder / "out").iterdir()) == ["seeds.json", "seeds.md", "seeds.png"]
     assert (folder / "out" / "seeds.png").read_bytes().startswith(b"\x89PNG")
-    assert "<svg" in (folder / "out" / "seeds.svg").read_text()
     page = (folder / "out" / "seeds.md").read_text()
     assert page.startswith("# The default run\n")
-    assert "base trained for 128 environment steps; targets turn." in page
-    assert "2 iterations a trial with the cpu budget, 2 seed(s), 2 episodes a clip." in page
+    assert "base trained for 128 environment steps; targets: turn." in page
+    assert "2 iterations a run with the cpu preset, 2 seed(s), 2 episodes a clip." in page
+    here = provenance()
+    assert f"- Made by code {here.code} (commit {here.commit[:7]}), Python {here.python}, JAX {here.jax}, " in page
+    assert f", {here.cores} cores of {here.processor}.\n" in page
+    assert "## What it says of the paper's claims" in page
     assert "*paper: λ = 16*" in page
     assert "Next: make experiments" in printed
 
@@ -86,13 +91,14 @@ def test_its_numbers_are_those_of_the_trials_over_the_seeds(swept):
     for group in ("target", "kept"):
         for metric in ("survival_weighted_tracking", "episode_length"):
             values = [json.loads(run.read_text())["policies"]["unlearned"][group][metric]["mean"] for run in runs]
-            found = variant["over_seeds"]["policy"][group][metric]
+            found = estimates(variant)["policy"][group][metric]
             low, high = stats.t.interval(0.95, 1, loc=np.mean(values), scale=stats.sem(values))
-            assert (found["mean"], found["low"], found["high"]) == pytest.approx((np.mean(values), low, high))
-    assert variant["over_seeds"]["lambda_crit"]["mean"] == pytest.approx(
-        np.mean([json.loads(row)["target/lambda_crit"] for run in (folder / "trials").glob("*/metrics.jsonl")
-                 for row in run.read_text().splitlines()[:1]])
-    )  # fmt: skip
+            assert (found["mean"], found["low"], found["high"]) == pytest.approx((np.mean(values), low, high), rel=1e-4)
+    first = [json.loads(log.read_text().splitlines()[0]) for log in (folder / "trials").glob("*/metrics.jsonl")]
+    measured = [row["target/lambda_crit"] for row in first if row["target/step_share"] > 0.0]
+    assert 1 <= len(measured) <= 2
+    crit = estimates(variant)["lambda_crit"]
+    assert (crit["mean"], crit["n"]) == (pytest.approx(np.mean(measured)), len(measured))
     assert document["failed"] == {}
 
 
@@ -132,7 +138,7 @@ def test_a_further_seed_runs_alone_where_the_numbers_of_the_others_are_stored(sw
     assert [trial.flags[trial.flags.index("--seed") + 1] for trial in asked_for] == ["2"]
     (extended,) = json.loads((tmp_path / "seeds.json").read_text())["results"]["variants"].values()
     assert list(extended["seeds"].items())[:2] == list(stored["seeds"].items())
-    assert extended["over_seeds"]["policy"]["kept"]["episode_length"]["n"] == 3
+    assert estimates(extended)["policy"]["kept"]["episode_length"]["n"] == 3
 
 
 def test_a_further_seed_that_fails_leaves_the_others_and_is_told(swept, base_run, monkeypatch, tmp_path):
@@ -147,41 +153,105 @@ def test_a_further_seed_that_fails_leaves_the_others_and_is_told(swept, base_run
     assert list(document["failed"].values()) == ["no luck"]
 
 
-def test_what_tells_of_no_trials_is_passed_over(tmp_path):
-    (tmp_path / "list.json").write_text("[1]")
-    (tmp_path / "other.json").write_text('{"results": [1]}')
-    (tmp_path / "old.json").write_text('{"study": "old", "results": {"variants": {"a": {"seeds": {"0": {}}}}}}')
-    (tmp_path / "new.json").write_text(
-        '{"study": "new", "results": {"variants": {"a": {"seeds": {"0": {"x": 1}}, "trials": {"0": "trial"}}}}}'
-    )
-    assert study.known_trials(tmp_path) == {"trial": {"x": 1}}
+OTHER = dataclasses.replace(provenance(), code="0123abcd", commit="f" * 40)
+
+
+@pytest.fixture
+def by_other_code(swept, tmp_path) -> Path:
+    """A folder with the swept numbers and trials as if other code had made them."""
+    text = (swept[0] / "out" / "seeds.json").read_text()
+    for name in ("code", "commit"):
+        text = text.replace(getattr(provenance(), name), getattr(OTHER, name))
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "seeds.json").write_text(text)
+    for trial in (swept[0] / "trials").glob("*-s*/"):
+        copy = shutil.copytree(trial, tmp_path / "trials" / trial.name.replace(provenance().code, OTHER.code))
+        evaluation = json.loads((trial / "evaluation.json").read_text())
+        (copy / "evaluation.json").write_text(json.dumps(evaluation | {"made": dataclasses.asdict(OTHER)}))
+    return tmp_path
+
+
+def test_numbers_of_other_code_that_answer_the_question_stay_and_say_so(by_other_code, base_run, monkeypatch):
+    monkeypatch.setattr(trials, "run_trials", None)
+    before = (by_other_code / "out" / "seeds.json").read_bytes()
+    finished(sweep.main, options(sweep.Options, base_run, by_other_code, kind="seeds"))
+    assert (by_other_code / "out" / "seeds.json").read_bytes() == before
+    assert "- Made by code 0123abcd (commit fffffff), " in (by_other_code / "out" / "seeds.md").read_text()
+
+
+def test_rows_of_other_code_are_not_added_to(by_other_code, base_run, refused, monkeypatch):
+    monkeypatch.setattr(trials, "run_trials", None)
+    told = refused(sweep.main, options(sweep.Options, base_run, by_other_code, kind="seeds", seeds=3))
+    assert "seeds.json: made by code 0123abcd (commit fffffff), and this is code " in told
+    assert told.endswith("--mix-commits puts their runs into one table, another --output keeps them apart")
+
+
+def mixed(by_other_code: Path, base_run: Run, swept: Path, monkeypatch, **given) -> tuple[list[str], Path]:
+    """The seeds that a sweep over three of them runs with --mix-commits, and where it wrote."""
+    ran = []
+
+    def stand_in(asked, **_):
+        ran.extend(trial.flags[trial.flags.index("--seed") + 1] for trial in asked)
+        for trial in asked:
+            shutil.copytree(next((swept / "trials").glob("*-s1-*/")), trial.folder)
+        return {}
+
+    monkeypatch.setattr(trials, "run_trials", stand_in)
+    asked = options(sweep.Options, base_run, by_other_code, kind="seeds", seeds=3, mix_commits=True, **given)
+    finished(sweep.main, asked)
+    return ran, asked.output
+
+
+@pytest.mark.parametrize("known", ["numbers", "folders"])
+def test_rows_of_other_code_are_mixed_in_where_the_user_says_so(
+    by_other_code, base_run, swept, tmp_path, monkeypatch, known
+):
+    given = {"trials": tmp_path / "none"} if known == "numbers" else {"output": tmp_path / "new"}
+    ran, output = mixed(by_other_code, base_run, swept[0], monkeypatch, **given)
+    assert ran == ["2"]
+    (variant,) = json.loads((output / "seeds.json").read_text())["results"]["variants"].values()
+    codes = {seed: name.rpartition("-")[2] for seed, name in variant["trials"].items()}
+    assert codes == {"0": "0123abcd", "1": "0123abcd", "2": provenance().code}
+    lines = [line for line in (output / "seeds.md").read_text().splitlines() if line.startswith("- Made by")]
+    assert len(lines) == 2
+    by_code = {code: line for line in lines for code in set(codes.values()) if f"code {code} " in line}
+    assert by_code["0123abcd"].endswith(": λ = 16 (seeds 0, 1).")
+    assert by_code[provenance().code].endswith(": λ = 16 (seed 2).")
+
+
+def test_trials_of_other_code_are_not_found(by_other_code, base_run, tmp_path, monkeypatch):
+    monkeypatch.setattr(trials, "run_trials", lambda asked, **_: dict.fromkeys(asked, f"{len(asked)} asked for"))
+    asked = options(sweep.Options, base_run, by_other_code, kind="seeds", output=tmp_path / "new")
+    with pytest.raises(InputError, match="2 asked for"):
+        sweep.main(asked)
 
 
 def test_the_files_can_be_drawn_from_the_numbers_alone(swept, tmp_path):
     folder, _ = swept
     shutil.copy(folder / "out" / "seeds.json", tmp_path)
     finished(sweep.main, sweep.Options(kind="seeds", draw=True, output=tmp_path, base=Path("gone")))
-    for name in ("seeds.md", "seeds.png", "seeds.svg"):
+    for name in ("seeds.md", "seeds.png"):
         assert (tmp_path / name).read_bytes() == (folder / "out" / name).read_bytes()
 
 
 def test_a_trial_that_fails_is_told_on_the_page_and_in_the_exit_code(swept, base_run, tmp_path, capsys, monkeypatch):
-    asked = options(sweep.Options, base_run, swept[0], kind="seeds", output=tmp_path)
+    asked = options(sweep.Options, base_run, tmp_path, kind="seeds")
+    first, second = sorted((swept[0] / "trials").glob("*-s*/"))
+    shutil.copytree(first, tmp_path / "trials" / first.name)
 
     def results() -> tuple[dict, str]:
-        document = json.loads((tmp_path / "seeds.json").read_text())
+        document = json.loads((tmp_path / "out" / "seeds.json").read_text())
         return document["failed"], " ".join(document["results"]["variants"]["λ = 16"]["seeds"])
 
     with monkeypatch.context() as patch:
-        patch.setattr(trials, "run_trials", lambda asked, **_: {asked[1]: "no luck"})
+        patch.setattr(trials, "run_trials", lambda asked, **_: {trial: "no luck" for trial in asked})
         with pytest.raises(SystemExit) as exit_:
             sweep.main(asked)
     assert exit_.value.code == 1
     assert "1 trials failed; the same command tries them again" in capsys.readouterr().err
-    failed, seeds = results()
-    (name,) = failed
-    assert f"- Failed: `{name}`: no luck" in (tmp_path / "seeds.md").read_text()
-    assert seeds == "0"
+    assert results() == ({second.name: "no luck"}, "0")
+    assert f"- Failed: `{second.name}`: no luck" in (tmp_path / "out" / "seeds.md").read_text()
+    shutil.copytree(second, tmp_path / "trials" / second.name)
     sweep.main(asked)  # tries what failed again
     assert results() == ({}, "0 1")
 
@@ -232,7 +302,7 @@ def test_where_every_trial_fails_nothing_is_written(refused, base_run, tmp_path,
         ({"kind": "seeds", "targets": ","}, "--targets: no clip named; name at least one to forget, such as "),
         ({"kind": "seeds", "targets": "sway,turn,nod"}, "targets: all 3 clips of the library; leave at least one"),
         ({"kind": "seeds", "base": Path("nowhere")}, "nowhere: no such checkpoint folder"),
-        ({"kind": "seeds", "robot": "h2"}, "robot: the checkpoint's is 'g1', this run's 'h2'"),
+        ({"kind": "seeds", "robot": "h2"}, "robot: found 'g1'; --robot is 'h2'"),
         ({"kind": "seeds", "draw": True}, "seeds.json: not measured yet; leave --draw out"),
     ],
 )
@@ -252,14 +322,14 @@ def test_help_lists_what_a_study_takes(capsys):
     validity = importlib.import_module("experiments.validity").STUDY
     commands = (
         lambda: parse(sweep.Options, "sweep", ["--help"]),
-        lambda: study.main(validity, arguments=["--help"]),
+        lambda: conduct.main(validity, arguments=["--help"]),
     )
     for command in commands:
         with pytest.raises(SystemExit) as exit_:
             command()
         assert exit_.value.code == 0
         text = capsys.readouterr().out
-        for flag in ("--budget {cpu,paper}", "--seeds INT", "--jobs INT", "--draw", "(default: 3)"):
+        for flag in ("--preset {cpu,paper}", "--mix-commits", "--seeds INT", "--jobs INT", "--draw", "(default: 3)"):
             assert flag in text
 
 
@@ -288,11 +358,11 @@ def test_every_study_comes_to_its_page_and_figure(name, base_run, watched_run, t
     monkeypatch.setattr(trials, "run_trials", stand_in)
     module = importlib.import_module(f"experiments.{name}")
     other_clips = name in ("motion_types", "number_of_targets")
-    subject = sweep.targets_study(("turn", "nod"), name, module.STUDY.title) if other_clips else module.STUDY
-    given = options(study.Options, base_run, tmp_path)
-    run = finished(lambda given: study.conduct(subject, given, "make experiments"), given)
+    subject = targets_study(("turn", "nod"), name, module.STUDY.title) if other_clips else module.STUDY
+    given = options(lab.Options, base_run, tmp_path)
+    run = finished(lambda given: conduct.conduct(subject, given, "make experiments"), given)
     out = tmp_path / "out"
-    assert sorted(path.suffix for path in out.glob(f"{name}.*")) == [".json", ".md", ".png", ".svg"]
+    assert sorted(path.suffix for path in out.glob(f"{name}.*")) == [".json", ".md", ".png"]
     assert asked_for
     page = (out / f"{name}.md").read_text()
     assert page.startswith(f"# {subject.title}\n")
@@ -315,8 +385,8 @@ def test_the_comparison_asks_for_every_method_and_every_sampler_with_and_without
 
     monkeypatch.setattr(trials, "run_trials", stand_in)
     module = importlib.import_module("experiments.comparison")
-    given = options(study.Options, base_run, tmp_path, control_iterations=7)
-    finished(lambda given: study.conduct(module.STUDY, given, ""), given)
+    given = options(lab.Options, base_run, tmp_path, control_iterations=7)
+    finished(lambda given: conduct.conduct(module.STUDY, given, ""), given)
     from forgetmimic_jax.unlearning.registry import methods
 
     assert {key[0] for key in asked_for} == methods().keys()
@@ -326,8 +396,3 @@ def test_the_comparison_asks_for_every_method_and_every_sampler_with_and_without
     assert {key[4] for key in asked_for if key[0] == "finetune"} == {None, "all"}
     assert [given.iterations for key, given in asked_for.items() if key[0] == "retrain"] == [7]  # once, on a laptop
     assert {key[5] for key in asked_for if key[0] != "retrain"} == {0, 1}
-
-
-def test_the_penalty_where_half_of_the_skill_is_gone_lies_between_two_that_were_tried():
-    assert sweep.half_gone({16.0: 0.1, 4.0: 0.9, 8.0: 0.7}) == pytest.approx(8.0 * 2.0 ** (0.2 / 0.6))
-    assert sweep.half_gone({4.0: 0.9, 16.0: 0.6}) is None

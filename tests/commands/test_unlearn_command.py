@@ -18,6 +18,7 @@ from forgetmimic_jax.motion.library import DATA_DIR, read_manifest
 from forgetmimic_jax.settings.config import load_config, validate
 from forgetmimic_jax.tracking.setup import make_setup
 from forgetmimic_jax.training import checkpoint, start
+from forgetmimic_jax.training.unlearning_run import config_of_new_run
 
 
 @pytest.fixture
@@ -172,12 +173,12 @@ def test_a_stop_during_the_evaluation_says_how_to_go_on(unlearned_run, evaluated
 
 
 def test_targets_are_the_library_s_own_unless_named(options):
-    assert unlearn.config_of_new_run(options(targets=None)).unlearn.targets == ("turn",)
-    assert unlearn.config_of_new_run(options(targets="nod,sway")).unlearn.targets == ("nod", "sway")
+    assert config_of_new_run(options(targets=None)).unlearn.targets == ("turn",)
+    assert config_of_new_run(options(targets="nod,sway")).unlearn.targets == ("nod", "sway")
 
 
 def test_a_preset_brings_its_settings_but_keeps_the_base_s_network(options, base_run):
-    config = unlearn.config_of_new_run(options(preset="paper", seed=3))
+    config = config_of_new_run(options(preset="paper", seed=3))
     base = load_config(base_run.folder / "config.yaml")
     assert (config.preset, config.iterations, config.seed, config.library) == ("paper", 1000, 3, base.library)
     assert (config.ppo.num_envs, config.ppo.actor_layers, config.ppo.critic_layers) == (4096, (16,), (16,))
@@ -288,7 +289,7 @@ def test_flags_that_contradict_the_run_to_resume_are_told(refused, unlearned_run
 
 def test_flags_choose_the_sampler_and_the_wrench(options):
     def settings(**given) -> tuple[str, str, float]:
-        config = unlearn.config_of_new_run(options(**given))
+        config = config_of_new_run(options(**given))
         return config.sampling.rule, config.sampling.clips, config.wrench.max_gain
 
     assert settings() == ("uniform_clips", "all", 0.0)
@@ -316,7 +317,7 @@ def test_flags_choose_the_sampler_and_the_wrench(options):
 )
 def test_targets_get_a_share_of_the_uniform_starts_at_the_laptops_pace(options, unlearned_run, given, share):
     for base in ({}, {"base": unlearned_run.checkpoint(2)}):  # whose own training had the share
-        config = unlearn.config_of_new_run(options(**given, **base))
+        config = config_of_new_run(options(**given, **base))
         assert config.sampling.target_share == share
         validate(config)
 
@@ -324,19 +325,19 @@ def test_targets_get_a_share_of_the_uniform_starts_at_the_laptops_pace(options, 
 def test_a_wrench_that_the_base_did_not_have_is_the_paper_s(options, damaged):
     config = damaged / "config.yaml"
     config.write_text(config.read_text().replace("max_gain: 0.5", "max_gain: 0.0"))
-    assert unlearn.config_of_new_run(options(base=damaged)).wrench.max_gain == 0.0
-    assert unlearn.config_of_new_run(options(base=damaged, wrench=True)).wrench.max_gain == 0.6
+    assert config_of_new_run(options(base=damaged)).wrench.max_gain == 0.0
+    assert config_of_new_run(options(base=damaged, wrench=True)).wrench.max_gain == 0.6
 
 
 def test_a_policy_from_scratch_is_held_by_nothing(options, unlearned_run):
     base = unlearned_run.checkpoint(2)
-    weights = [unlearn.config_of_new_run(options(method=name, base=base)).ppo.base_kl for name in ("arft", "retrain")]
+    weights = [config_of_new_run(options(method=name, base=base)).ppo.base_kl for name in ("arft", "retrain")]
     assert weights == [0.1, 0.0]
 
 
 def test_a_distilled_policy_starts_afresh_and_is_pulled_towards_the_base_at_any_scale(options, base_run, tmp_path):
-    assert unlearn.config_of_new_run(options(method="distill", iterations=None)).iterations == 200
-    assert unlearn.config_of_new_run(options(method="distill", preset="paper")).ppo.base_kl == 1.0
+    assert config_of_new_run(options(method="distill", iterations=None)).iterations == 200
+    assert config_of_new_run(options(method="distill", preset="paper")).ppo.base_kl == 1.0
     output = tmp_path / "run"
     unlearn.main(options(method="distill", iterations=2, episodes=2, output=output))
     start, base = load_state(output / "checkpoints" / "00000000"), load_state(base_run.checkpoint(4))
@@ -344,19 +345,20 @@ def test_a_distilled_policy_starts_afresh_and_is_pulled_towards_the_base_at_any_
     rows = read_rows(output / "metrics.jsonl")
     assert all(row["base_kl"] > 0.0 for row in rows)
     assert all(row["target/step_share"] == 0.0 for row in rows)
+    assert {name for row in rows for name in row if name.startswith("target/")} == {"target/step_share"}
     assert load_config(output / "config.yaml").ppo.base_kl == 1.0
     policies = json.loads((output / "evaluation.json").read_text())["policies"]
     assert policies.keys() == {"base", "unlearned", "zero_action"}
 
 
 def test_retraining_takes_as_many_steps_as_the_base_did(options):
-    assert unlearn.config_of_new_run(options(method="retrain")).iterations == 4
-    assert unlearn.config_of_new_run(options(method="retrain", iterations=None, preset="paper")).iterations == 1
+    assert config_of_new_run(options(method="retrain")).iterations == 4
+    assert config_of_new_run(options(method="retrain", iterations=None, preset="paper")).iterations == 1
 
 
 @pytest.mark.parametrize("given", [{"sampler": "adaptive"}, {"sampler": "frozen"}, {"wrench": True}])
 def test_what_goes_by_failure_levels_goes_on_with_the_base_s(options, base_run, given):
-    setup = make_setup(unlearn.config_of_new_run(options(**given)))
+    setup = make_setup(config_of_new_run(options(**given)))
     base = load_state(base_run.checkpoint(4)).failure_level
     np.testing.assert_array_equal(started(setup).failure_level, base)
     assert (np.asarray(base) != 1.0).any()

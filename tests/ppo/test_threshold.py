@@ -53,6 +53,20 @@ def test_the_critical_penalty_is_where_a_target_steps_mean_reward_changes_its_si
         assert np.sign(reward[0]) == sign
 
 
+def test_a_group_without_a_step_has_no_means_and_no_threshold():
+    sums = {"steps": [30.0, 0.0, 50.0], "tracking": [210.0, 0.0, 270.0]}
+    sums |= {"regularisation": [15.0, 0.0, 1.0], "normalized": [26.25, 0.0, 33.75]}
+    metrics = threshold_metrics(
+        forgetting(16.0), jnp.array([False, True, False]), **{name: jnp.array(values) for name, values in sums.items()}
+    )
+    assert metrics.pop("target/step_share") == 0.0
+    assert {name for name, value in metrics.items() if np.isnan(value)} == {
+        *("target/R_track", "target/R_reg", "target/R_anti", "target/tracking_reward", "target/lambda_crit"),
+    }
+    assert metrics["kept/R_track"] == pytest.approx(6.0)
+    assert metrics["kept/step_share"] == 1.0
+
+
 def test_ordinary_training_logs_no_threshold():
     assert metrics_of(Config()) == {}
 

@@ -1,7 +1,11 @@
 """Trials as processes. The process here is a few lines that write what a run writes, so that only the care counts."""
 
+import dataclasses
 import fcntl
+import json
 import os
+import re
+import shutil
 import signal
 import sys
 import threading
@@ -10,9 +14,17 @@ from pathlib import Path
 
 import pytest
 
+from forgetmimic_jax import unlearn
 from forgetmimic_jax.basics.errors import Interrupted
+from forgetmimic_jax.basics.provenance import provenance
+from forgetmimic_jax.motion.library import DATA_DIR
+from forgetmimic_jax.settings.config import Config
+from forgetmimic_jax.settings.options import parse
 from forgetmimic_jax.studies import trials
-from forgetmimic_jax.studies.trials import Trial, make_trial, run_trials
+from forgetmimic_jax.studies.trials import Trial, make_trial, run_trials, without_code
+from forgetmimic_jax.training.start import base_folder
+from forgetmimic_jax.training.unlearning_run import config_of
+from forgetmimic_jax.unlearning import method
 
 RUN = """#!{python}
 import pathlib, signal, sys, time
@@ -49,7 +61,8 @@ def quick(tmp_path, monkeypatch):
 
 
 def trial(tmp_path: Path, seed: int) -> Trial:
-    return Trial(tmp_path / "trials" / f"s{seed}", ("--seed", str(seed)), 1)
+    config = dataclasses.replace(Config(), iterations=1, seed=seed)
+    return Trial(tmp_path / "trials" / f"s{seed}", config, ("--seed", str(seed)))
 
 
 def journal(tmp_path: Path) -> list[str]:
@@ -101,7 +114,7 @@ def test_a_stop_lets_the_running_trial_save_and_the_next_time_it_is_resumed(tmp_
     for expected in (["start 9", "stopped 9"], ["start 9+", "stopped 9+"]):
         thread = threading.Thread(target=stop_at, args=(expected[0],))
         thread.start()
-        with pytest.raises(Interrupted, match="what is finished is kept; the same command goes on"):
+        with pytest.raises(Interrupted, match="finished trials are kept; the same command continues"):
             run_trials([asked], jobs=1, description="try")
         thread.join()
         assert journal(tmp_path)[-2:] == expected
@@ -113,7 +126,7 @@ def test_a_trial_at_which_another_process_works_is_left_to_it(tmp_path):
     asked[0].log.parent.mkdir(parents=True)
     with asked[0].log.open("a") as log:
         fcntl.flock(log, fcntl.LOCK_EX)
-        assert run_trials(asked, jobs=1, description="try") == {asked[0]: "another process is at work on it"}
+        assert run_trials(asked, jobs=1, description="try") == {asked[0]: "another process runs it"}
     assert journal(tmp_path) == ["start 3", "end 3"]
 
 
@@ -127,38 +140,52 @@ def test_a_folder_without_a_checkpoint_is_begun_anew(tmp_path):
 
 @pytest.fixture
 def base(tmp_path) -> Path:
-    return written(tmp_path / "base")
+    return Path(shutil.copytree(base_folder("g1"), tmp_path / "base"))
 
 
-def written(folder: Path, meta: str = "one", settings: str = "fast") -> Path:
-    folder.mkdir(exist_ok=True)
-    (folder / "meta.json").write_text(meta)
-    (folder / "config.yaml").write_text(settings)
-    return folder
-
-
-def test_a_trial_s_folder_says_what_it_is_and_its_flags_leave_defaults_out(tmp_path, base):
+def test_a_trials_folder_says_what_it_is_and_its_flags_make_its_settings(tmp_path, base):
     found = make_trial(tmp_path, {"base": base, "iterations": 5, "penalty": 16.0, "seed": 2, "method": "arft"})
-    assert found.folder.name.startswith("arft-s2-")
-    assert found.flags == ("--base", str(base), "--iterations", "5", "--seed", "2")
-    other = make_trial(
-        tmp_path,
-        {"base": base, "iterations": 5, "penalty": 8.0, "wrench": True, "sampler": None, "set": ["a=1", "b=2"]},
-    )
-    assert other.folder.name.startswith("arft-penalty_8.0-wrench_True-s0-")
-    assert other.flags[4:] == ("--penalty", "8.0", "--wrench", "--set", "a=1", "b=2")
-    assert other.iterations == 5
+    assert re.fullmatch(rf"arft-punch\+kick-s2-[0-9a-f]{{8}}-{provenance().code}", found.folder.name)
+    assert found.flags == ("--iterations", "5", "--seed", "2", "--base", str(base))
+    asked = {"base": base, "iterations": 5, "penalty": 8.0, "wrench": True, "sampler": None, "targets": "run, walk"}
+    other = make_trial(tmp_path, {**asked, "physics": "native", "set": ["ppo.base_kl=0.5", "ppo.epochs=7"]})
+    assert other.folder.name.startswith("arft-run+walk-s0-")
+    assert without_code(other.folder.name) + f"-{provenance().code}" == other.folder.name
+    config = other.config
+    assert (config.unlearn.penalty, config.ppo.base_kl, config.ppo.epochs) == (8.0, 0.5, 7)
+    assert (config.iterations, other.iterations, config.physics.engine) == (5, 5, "native")
+    assert config.wrench.max_gain > 0.0
+    for trial in (found, other):  # what the process makes of the flags is the trial's config
+        assert config_of(parse(unlearn.Options, "unlearn", trial.flags)) == trial.config
 
 
 def test_the_same_question_has_the_same_folder_wherever_its_base_lies(tmp_path, base):
     asked = {"base": base, "iterations": 5, "penalty": 8.0}
-    moved = base.rename(tmp_path / "moved")
+    moved = Path(shutil.copytree(base, tmp_path / "moved"))
     same = make_trial(tmp_path, {"penalty": 8.0, "iterations": 5, "method": "arft", "base": moved})
-    written(tmp_path / "base")
     assert make_trial(tmp_path, asked).folder == same.folder
-    different = [{"penalty": 9.0}, {"iterations": 6}, {"seed": 1}, {"set": ["a=1"]}]
+    assert make_trial(tmp_path, {**asked, "targets": "punch,kick"}).folder == same.folder  # the default
+    different = [{"penalty": 9.0}, {"iterations": 6}, {"seed": 1}, {"set": ["ppo.base_kl=0.5"]}, {"episodes": 3}]
     folders = {make_trial(tmp_path, asked | change).folder for change in different}
-    for meta, settings in (("two", "fast"), ("one", "slow")):
-        written(tmp_path / "base", meta, settings)
-        folders.add(make_trial(tmp_path, asked).folder)
-    assert len(folders | {same.folder}) == 7
+    meta = json.loads((base / "meta.json").read_text())
+    (base / "meta.json").write_text(json.dumps({**meta, "iteration": meta["iteration"] + 1}))
+    folders.add(make_trial(tmp_path, asked).folder)
+    library = Path(shutil.copytree(DATA_DIR / "g1", tmp_path / "library", ignore=shutil.ignore_patterns("base")))
+    assert make_trial(tmp_path, {**asked, "base": moved, "library": library}).folder == same.folder
+    (library / "punch.npz").write_bytes((library / "kick.npz").read_bytes())
+    folders.add(make_trial(tmp_path, {**asked, "base": moved, "library": library}).folder)
+    assert len(folders | {same.folder}) == 8
+
+
+def test_a_default_that_changes_makes_another_trial(tmp_path, base, monkeypatch):
+    before = make_trial(tmp_path, {"base": base, "iterations": 5})
+    monkeypatch.setitem(method.SHORT, "learning_rate", 2e-4)
+    assert make_trial(tmp_path, {"base": base, "iterations": 5}).folder != before.folder
+
+
+def test_other_code_makes_another_trial(tmp_path, base, monkeypatch):
+    found = [make_trial(tmp_path, {"base": base, "iterations": 5}).folder.name]
+    other = dataclasses.replace(provenance(), code="0123abcd")
+    monkeypatch.setattr(trials, "provenance", lambda: other)
+    found.append(make_trial(tmp_path, {"base": base, "iterations": 5}).folder.name)
+    assert found[1] == f"{without_code(found[0])}-0123abcd"

@@ -1,6 +1,6 @@
 """Variants of an unlearning run over seeds: from their evaluation.json to one table and one figure.
 
-`results["variants"]` of a study: {label: {"options", "seeds": {seed: summary}, "over_seeds": summary of estimates}}.
+`results["variants"]` of a study: {label: {"options", "trials": {seed: name}, "seeds": {seed: summary}}}.
 """
 
 from __future__ import annotations
@@ -21,32 +21,31 @@ from forgetmimic_jax.evaluation.tables import markdown_table, number, percent
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+TRACKING = "survival_weighted_tracking"
 DEVIATION = f"max_key_body_position_error{COMMON}"  # m
-METRICS = (
-    *("success_rate", "survival_weighted_tracking", "tracking_reward", "episode_length", "skill", "retention"),
-    DEVIATION,
-)
+METRICS = ("success_rate", TRACKING, "tracking_reward", "episode_length", "skill", "retention", DEVIATION)
 EPISODES = "episodes"  # of the group, behind its success rate
 RATIOS = ("degradation_ratio", "survival_weighted_degradation_ratio")
 
-
-HEADER = ("seeds", "success", "tracking", "while alive", "steps", "skill left")
+HEADER = ("seeds", "success", "tracking", "while alive", "steps", "skill retained")
 NOTES = (
-    "tracking: mean tracking reward over the horizon, 0 after a fall (survival-weighted); while alive: the paper's, "
-    "over the steps before it.",
-    "base and zero action: one policy each, on the episodes of every seed.",
-    "skill left: share of the base's skill above the zero action; ratio: target over kept, of tracking while alive "
-    "(the paper's) and of tracking.",
+    "tracking: mean tracking reward over the horizon, 0 after a fall (survival-weighted); while alive: the paper's "
+    "mean, over the steps before the fall.",
+    "base and zero action: one policy each, on the episodes of every seed. Zero action is the robot with zero actions, "
+    "the baseline of a policy that does nothing.",
+    "skill retained: share of the base's tracking above the zero-action baseline; ratio: target over kept, of tracking "
+    "while alive (the paper's) and of tracking.",
     "a success rate that is the same with every seed has the exact interval of all episodes together.",
 )
 THEIRS = "Rows of the paper: another library of clips, another base and another budget."
 
 
 def summary(folder: Path) -> dict[str, Any]:
-    """The means of a finished trial's evaluation: {"base", "policy", "zero_action": {"target", "kept", "clips", ...}}.
+    """The means of a finished trial's evaluation.
 
-    With `lambda_crit`, the threshold on target steps in the first iteration, whose steps are the base's own, and
-    `target_step_share`, how much of the training was spent on the targets.
+    {"base", "policy", "zero_action": {"target": {metric: mean}, "kept": {...}, "clips": {clip: tracking}, ratio: mean}}
+    with `lambda_crit`, the threshold on target steps in the first iteration, whose steps are the base's own, and
+    `target_step_share`, the share of all training steps that were on targets.
     """
     document = json.loads((folder / "evaluation.json").read_text())
     result: dict[str, Any] = {}
@@ -56,20 +55,25 @@ def summary(folder: Path) -> dict[str, Any]:
             for group in ("target", "kept")
             if group in policy
         }
-        clips = {clip: _means(metrics) for clip, metrics in policy["clips"].items()}
+        clips = {clip: metrics[TRACKING]["mean"] for clip, metrics in policy["clips"].items()}
         ratios = {ratio: policy[ratio]["mean"] for ratio in RATIOS if "mean" in policy.get(ratio, {})}
         result[name if name in (BASE, ZERO_ACTION) else "policy"] = {**groups, "clips": clips, **ratios}
     rows = read_rows(folder / "metrics.jsonl")
     if rows and "target/lambda_crit" in rows[0]:
         result["lambda_crit"] = rows[0]["target/lambda_crit"]
     if rows and "target/step_share" in rows[0]:
-        lived = np.diff([0, *(row["environment_steps"] for row in rows)])
-        result["target_step_share"] = float(np.average([row["target/step_share"] for row in rows], weights=lived))
+        steps = np.diff([0, *(row["environment_steps"] for row in rows)])
+        result["target_step_share"] = float(np.average([row["target/step_share"] for row in rows], weights=steps))
     return result
 
 
+def estimates(variant: Mapping[str, Any]) -> dict[str, Any]:
+    """A variant's `summary` with an estimate over its seeds in the place of each number."""
+    return over_seeds(list(variant["seeds"].values()))
+
+
 def gained(variants: Mapping[str, Any], label: str, other: str | None, group: str, metric: str) -> dict[str, float]:
-    """By seed: a variant's number less another's; see `paired`."""
+    """By seed: a variant's number minus another's; see `paired`."""
     return {seed: mine - theirs for seed, (mine, theirs) in paired(variants, label, other, group, metric).items()}
 
 
@@ -112,7 +116,7 @@ def over_seeds(runs: Sequence[Any]) -> Any:
         # No spread to learn from, as where all fail.
         episodes = sum(run[EPISODES] for run in runs)
         pooled = statistics.rate(round(result["success_rate"]["mean"] * episodes), episodes)
-        result["success_rate"] |= {end: pooled[end] for end in ("low", "high")}
+        result["success_rate"] |= {"low": pooled["low"], "high": pooled["high"], "episodes": episodes}
     return result
 
 
@@ -124,7 +128,7 @@ def variant_table(variants: Mapping[str, Any], theirs: Mapping[str, Any]) -> str
     targets = {variant["options"].get("targets") for variant in variants.values()}
     policies: dict[str, Any] = {}
     for place, (label, variant) in enumerate(variants.items()):
-        of = variant["over_seeds"]
+        of = estimates(variant)
         if len(targets) > 1 or place == 0:
             whose = f" ({label})" if len(targets) > 1 else ""
             policies |= {f"{name.replace('_', ' ')}{whose}": of[name] for name in (BASE, ZERO_ACTION)}
@@ -170,8 +174,8 @@ def _exact(numbers: Any) -> Any:
 
 def variant_bars(variants: Mapping[str, Any]) -> Figure:
     """Success, tracking, tracking while alive and steps of targets and kept clips, base and variants."""
-    first = next(iter(variants.values()))["over_seeds"]
-    policies = {"base": first[BASE]} | {label: variant["over_seeds"]["policy"] for label, variant in variants.items()}
+    over = {label: estimates(variant) for label, variant in variants.items()}
+    policies = {"base": next(iter(over.values()))[BASE]} | {label: of["policy"] for label, of in over.items()}
     figure = new_figure(width=2.0 + 0.8 * len(policies), height=9.0)
     for place, metric in enumerate(METRICS[:4]):
         axes = figure.add_subplot(4, 1, place + 1)

@@ -40,7 +40,7 @@ VALIDITY: dict[str, dict[str, Any]] = {
 ABLATION = {name: COMPARISON[name] for name in ("base", "ARFT with RSI", "ARFT with AW", "λ = 16")}
 
 # Table 'Sensitivity analysis of the penalty weight λ'. It prints "1 %" where its text says that the targets succeed.
-LAMBDA: dict[str, dict[str, Any]] = {
+PENALTY: dict[str, dict[str, Any]] = {
     f"λ = {penalty}": {
         "target": {"tracking_reward": target, "success_rate": success},
         "kept": {"tracking_reward": kept},

@@ -1,0 +1,92 @@
+"""The page of a study in Markdown, from its JSON alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from forgetmimic_jax.studies.claim import corrected, findings_table
+from forgetmimic_jax.studies.document import code_text
+from forgetmimic_jax.studies.lab import watched_episodes
+from forgetmimic_jax.studies.study import Study
+
+LAPTOP = (
+    "- With the cpu preset unlearning is KL-regularised towards the base on the kept clips, weighs all clips the same "
+    "and takes half of the starts from the targets. The paper does none of this, and neither do rows called plain PPO."
+)
+INTERVALS = (
+    "- In square brackets: the 95 % interval over seeds (Student's t). The seed is the unit; one seed has no interval."
+)
+WORDS = (
+    "A claim *holds* where the whole 95 % interval of its number is on the right side of the bound, *does not hold* "
+    "where it is on the wrong side, and is *open* between. The words are corrected for the number of claims (Holm; the "
+    "main claim and the further findings apart), so a claim may be open although its own interval clears the bound. "
+    "One seed has no interval: its word only says to which side the number points."
+)
+
+
+def page(study: Study, document: Mapping[str, Any]) -> str:
+    """The whole page."""
+    lines = [
+        f"# {study.title}",
+        "",
+        f"The paper: {study.claim}",
+        "",
+        *conditions(study, document),
+        "",
+        study.body(document),
+        "## What it says of the paper's claims",
+        "",
+        findings_table(corrected(study.findings(document))),
+        WORDS,
+        "",
+        f"![{study.title}]({study.name}.png)",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def conditions(study: Study, document: Mapping[str, Any]) -> Iterator[str]:
+    """What the numbers were made with, a list item each."""
+    asked = document["asked"]
+    variants = document["results"].get("variants", {}).values()
+    own_targets = any("targets" in variant["options"] for variant in variants)
+    targets = "" if own_targets else f"; targets: {', '.join(asked['targets'])}"
+    episodes = watched_episodes(asked["episodes"]) if study.watches else asked["episodes"]
+    yield f"- Robot {asked['robot']}; base trained for {asked['base_environment_steps']:,} environment steps{targets}."
+    yield (
+        f"- {asked['iterations']:,} iterations a run with the {asked['preset']} preset, {asked['seeds']} seed(s), "
+        f"{episodes} episodes a clip."
+    )
+    yield from origins(document)
+    if asked["preset"] == "cpu":
+        yield LAPTOP
+    yield INTERVALS
+    for name, reason in document["failed"].items():
+        yield f"- Failed: `{name}`: {reason}"
+
+
+def origins(document: Mapping[str, Any]) -> Iterator[str]:
+    """Which code and machine made the runs; where several did, which made which run."""
+    groups = document["made_by"]
+    older = [group["commit"][:7] for group in groups if not group["code"]]
+    if older:
+        yield f"- Made by older code (stored with commit {', '.join(older)}): today's code may give other numbers."
+    for group in groups:
+        if not group["code"]:
+            continue
+        machine = ""
+        if "processor" in group:
+            machine = f", Python {group['python']}, JAX {group['jax']}, MuJoCo {group['mujoco']}"
+            machine += f", {group['cores']} cores of {group['processor']}"
+        which = f": {_runs(group['runs'])}" if len(groups) > 1 else ""
+        yield f"- Made by {code_text(group)}{machine}{which}."
+
+
+def _runs(names: list[str]) -> str:
+    """'λ = 8 (seeds 0, 1); λ = 16 (seed 0)' from the names of runs."""
+    seeds: dict[str, list[str]] = {}
+    for name in names:
+        label, _, seed = name.rpartition(", seed ")
+        seeds.setdefault(label, []).append(seed)
+    return "; ".join(f"{label} (seed{'s'[: len(of) - 1]} {', '.join(of)})" for label, of in seeds.items())

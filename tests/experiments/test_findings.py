@@ -1,0 +1,352 @@
+"""What each study says of the paper's claims, from numbers made up for it."""
+
+import math
+
+import pytest
+
+from experiments import comparison, heat_map, membership, physical_behaviour, relearning, training_dynamics, validity
+from forgetmimic_jax.evaluation.relearning import Lasted
+from forgetmimic_jax.evaluation.statistics import over_seeds
+from forgetmimic_jax.evaluation.verdict import _sooner
+from forgetmimic_jax.studies import penalty, samplers, targets
+from forgetmimic_jax.studies.findings import mean_gained
+from forgetmimic_jax.studies.variants import DEVIATION
+
+
+def variant(target: list[float], kept: list[float], base: float = 0.6, skill: list[float] | None = None) -> dict:
+    """As a study's JSON has it, a seed each."""
+
+    def group(value: float) -> dict:
+        return {"success_rate": value, "survival_weighted_tracking": value, "episodes": 40}
+
+    seeds = {
+        str(seed): {
+            "policy": {"target": group(a), "kept": group(b)},
+            "base": {"target": group(0.8), "kept": group(base)},
+        }
+        for seed, (a, b) in enumerate(zip(target, kept, strict=True))
+    }
+    for run, value in zip(seeds.values(), skill or [], strict=False):
+        run["policy"]["target"]["skill"] = value
+    return {"options": {}, "seeds": seeds}
+
+
+def words(findings) -> dict[str, str]:
+    return {found.claim: found.word for found in findings}
+
+
+def test_differences_are_between_runs_of_the_same_seed():
+    found = {"a": variant([0.0, 0.1], [0.5, 0.7]), "b": variant([0.1], [0.45])}
+    assert mean_gained(found, "a", None, "kept", "success_rate")["mean"] == pytest.approx(0.0)
+    only = mean_gained(found, "a", "b", "kept", "success_rate")
+    assert only == {"mean": pytest.approx(0.05), "n": 1}
+    assert mean_gained(found, "a", "c", "kept", "success_rate") is None
+
+
+def test_the_default_run_is_compared_with_its_control_the_ratio_and_zero_actions():
+    label, control = (validity.at_length(of) for of in ("λ = 16", validity.CONTROL))
+    found = {
+        "λ = 8": variant([0.5, 0.52, 0.51], [0.6, 0.6, 0.6]),
+        label: variant([0.0, 0.0, 0.0], [0.6, 0.6, 0.6], skill=[-0.1, -0.12, -0.11]),
+        control: variant([0.8, 0.8, 0.8], [0.67, 0.68, 0.69]),
+    }
+    runs = found[label]["seeds"].values()
+    for steps, ratio, run in zip((9.0, 9.5, 10.0), (0.05, 0.06, 0.07), runs, strict=True):
+        run["policy"]["survival_weighted_degradation_ratio"] = ratio
+        run["policy"]["target"] |= {"episode_length": steps, DEVIATION: 0.01 * steps}
+        run["zero_action"] = {"target": {"episode_length": 17.0, DEVIATION: 0.05}}
+    document = {"results": {"variants": found}}
+    every = list(validity.findings(document))
+    assert [(of.claim.removeprefix(f"{label}: "), of.word) for of in every if of.main] == [
+        ("the targets are no longer completed", "holds"),
+        ("the skill on the targets is gone", "holds"),
+        ("the kept clips stay as they were", "holds"),
+    ]
+    assert [(of.claim.removeprefix(f"{label}: "), of.word) for of in every if not of.main] == [
+        ("λ = 8: the targets are no longer completed", "does not hold"),
+        ("λ = 8: the kept clips stay as they were", "holds"),
+        ("the kept clips are as after fine-tuning alone", "does not hold"),
+        ("the targets' tracking is under a tenth of the kept clips'", "holds"),
+        ("the policy lacks the skill and does not end episodes on purpose", "does not hold"),
+        ("until it falls it is no further off a target than the zero-action baseline", "does not hold"),
+    ]
+    assert every[-2].evidence == (
+        "length of target episodes minus the zero-action baseline's -7.5 [-8.7, -6.3] steps; bound -1"
+    )
+    assert every[-1].evidence.startswith(
+        "largest key body error minus the zero-action baseline's 0.045 [0.033, 0.057] m, of 0.050 m, on the steps"
+    )
+    assert validity.answer(document) == (
+        f"With {label}, 0 % [0, 3] of the target episodes succeed, -11 % [-13, -9] of the skill is retained (below 0: "
+        "worse than with zero actions), and the success rate on the other clips changes by 0 % [0, 0] against the base."
+    )
+
+
+def test_the_comparison_by_hand():
+    prefix = f"{comparison.ARFT}, "
+    found = {
+        comparison.ARFT: variant([0.1, 0.1, 0.1], [0.59, 0.60, 0.61]),
+        comparison.CONTROL: variant([0.8, 0.8, 0.8], [0.60, 0.61, 0.62]),
+        comparison.PLAIN_ARFT: variant([0.2, 0.2, 0.2], [0.4, 0.4, 0.4]),
+        "negated reward, plain PPO": variant([0.0, 0.0, 0.0], [0.1, 0.12, 0.11]),
+        "decremental, plain PPO": variant([0.0, 0.0, 0.0], [0.5, 0.51, 0.52]),
+        "trajdeleter, plain PPO": variant([0.3, 0.31, 0.32], [0.5, 0.3, 0.4]),
+        f"{prefix}uniform clips": variant([0.2, 0.2, 0.2], [0.59, 0.60, 0.61]),
+        f"{prefix}uniform clips, wrench": variant([0.3, 0.2, 0.2], [0.6, 0.6, 0.6]),
+        f"{prefix}adaptive": variant([0.4, 0.3, 0.2], [0.4, 0.6, 0.5]),
+        f"{prefix}adaptive, wrench": variant([0.4, 0.5, 0.6], [0.4, 0.6, 0.5]),
+        f"{prefix}frozen": variant([0.6, 0.6, 0.6], [0.6, 0.6, 0.6]),
+        f"{prefix}frozen, wrench": variant([0.7, 0.71, 0.7], [0.6, 0.6, 0.6]),
+    }
+    document = {"results": {"variants": found}}
+    every = list(comparison.findings(document))
+    assert words(of for of in every if of.main) == {
+        "arft keeps the other clips better than negated reward (both plain PPO)": "holds",
+        "arft keeps the other clips better than decremental (both plain PPO)": "does not hold",
+        "arft keeps the other clips better than trajdeleter (both plain PPO)": "open",
+    }
+    assert words(of for of in every if not of.main) == {
+        "arft forgets more than trajdeleter (both plain PPO)": "holds",
+        "λ = 16: the kept clips are as after fine-tuning without an anti-reward": "holds",
+        "adaptive sampling resists forgetting": "holds",
+        "adaptive sampling costs the kept clips": "open",
+        "the feedback of adaptive sampling resists forgetting": "does not hold",
+        "the feedback of adaptive sampling costs the kept clips": "open",
+    }
+    assert "0.29 [0.27, 0.31] (negated reward); -0.11 [-0.13, -0.09] (decremental)" in comparison.answer(document)
+    pairs = [(f"{prefix}adaptive{more}", f"{prefix}uniform clips{more}") for more in ("", ", wrench")]
+    by_hand = [(0.2 + 0.1) / 2, (0.1 + 0.3) / 2, (0.0 + 0.4) / 2]
+    assert samplers.effect(found, pairs, "target") == pytest.approx(over_seeds(by_hand))
+    found[f"{prefix}uniform clips"] = variant([0.2], [0.6])
+    assert samplers.effect(found, pairs, "target") == {"mean": pytest.approx(0.15), "n": 1}
+
+
+def test_a_policy_that_falls_sooner_than_with_zero_actions_does_not_only_lack_a_skill():
+    policies = {
+        "base": {"0": {"episode_length": [60.0, 64.0]}},
+        "zero action": {"0": {"episode_length": [16.0, 18.0]}},
+        "λ = 16": {str(seed): {"episode_length": [5.0, 6.0 + seed]} for seed in range(3)},
+    }
+    document = {"results": {"policies": policies}}
+    assert [of.word for of in physical_behaviour.findings(document)] == ["does not hold"]
+    # means of 5.5, 6 and 6.5 steps
+    assert physical_behaviour.answer(document) == (
+        "An episode of a target lasts 6.0 [4.8, 7.2] steps; with the base 62.0, with zero actions 17.0."
+    )
+    for seed, run in policies["λ = 16"].items():
+        run["episode_length"] = [17.0, 17.0 + int(seed)]
+    measured = ("foot_contact", "joint_limit_violation", DEVIATION)
+    for label, values in (("base", (0.6, 0.1, 0.1)), ("zero action", (0.8, 0.2, 0.12))):
+        policies[label]["0"] |= {name: [value] for name, value in zip(measured, values, strict=True)}
+    for seed, run in policies["λ = 16"].items():
+        run |= {name: [value + 0.01 * int(seed)] for name, value in zip(measured, (0.4, 0.09, 0.2), strict=True)}
+    found = list(physical_behaviour.findings(document))
+    assert [(of.word, of.main) for of in found] == [
+        *(("holds", True), ("does not hold", True), ("holds", False), ("open", False))
+    ]
+    assert found[1].evidence == (
+        "max key body position error, common steps 0.210 [0.185, 0.235]; bound 0.120, the zero action's"
+    )
+    assert found[2].evidence == "foot contact 0.410 [0.385, 0.435]; bound 0.600, the base's"
+
+
+def test_the_training_curves_are_compared_with_what_the_paper_reads_off_them():
+    def rows(first: dict[str, list[float]], last: dict[str, list[float]]) -> dict:
+        return {"rows": [{name: over_seeds(values) for name, values in at.items()} for at in (first, last)]}
+
+    def found(of: dict) -> list[str]:
+        return [one.word for one in training_dynamics.findings({"results": {"configurations": of}})]
+
+    start = {"entropy": [5.0] * 3, "wrench_gain": [0.1, 0.11, 0.12], "top_bin_probability": [0.03] * 3}
+    end = {"entropy": [4.0, 4.1, 4.2], "wrench_gain": [0.11, 0.13, 0.12], "top_bin_probability": [0.02, 0.021, 0.022]}
+    assert found({training_dynamics.A: rows(start, end)}) == ["holds", "open", "does not hold"]
+    anti = {"entropy": [5.0] * 3, "target/R_anti": [-10.0, -11.0, -9.0]}
+    gone = {"entropy": [5.5, 5.6, 5.7], "target/R_anti": [-0.5, -0.6, -0.7]}
+    b = training_dynamics.B
+    assert found({b: rows(anti, gone)}) == ["holds", "holds"]
+    assert found({b: rows(anti, {**gone, "target/R_anti": [-8.0, -8.1, -8.2]})}) == ["holds", "does not hold"]
+    assert found({b: rows({n: v[:1] for n, v in anti.items()}, {n: v[:1] for n, v in gone.items()})}) == [
+        "one seed: yes",
+        "one seed: yes",
+    ]
+
+
+def test_two_intervals_differ_by_no_more_than_both_say():
+    last, first = over_seeds([4.0, 5.0, 6.0]), over_seeds([1.0, 2.0, 3.0])
+    found = training_dynamics.difference(last, first)
+    half = 4.302652729911275 * 1.0 / 3**0.5  # Student's t of two degrees of freedom
+    assert found == {
+        **{"mean": 3.0, "n": 3, "std": 2.0},  # a standard deviation of 2 gives the same interval
+        **{"low": pytest.approx(3 - 2 * half), "high": pytest.approx(3 + 2 * half)},
+    }
+
+
+def swept(skills: dict[float, list[float]]) -> dict:
+    """As the JSON of the penalties has it: by penalty, the skill of each seed."""
+    return {
+        str(penalty): {
+            "options": {"penalty": str(penalty)},
+            "seeds": {
+                str(seed): {"policy": {"target": {"skill": skill}}, "lambda_crit": 7.6 + 0.1 * seed}
+                for seed, skill in enumerate(of)
+            },
+        }
+        for penalty, of in skills.items()
+    }
+
+
+@pytest.mark.parametrize(
+    ("skills", "word", "evidence"),
+    [
+        # 4 x 2^(0.4 / 0.8), 4 x 2^(0.4 / 0.78) and 4 x 2^(0.4 / 0.79)
+        ({4.0: [0.9, 0.9, 0.9], 8.0: [0.1, 0.12, 0.11]}, "holds", "5.7 [5.6, 5.7]"),
+        # 8 x 2^(0.4 / 0.8)
+        ({8.0: [0.9, 0.9, 0.9], 16.0: [0.1, 0.1, 0.1]}, "does not hold", "11.3 [11.3, 11.3]"),
+        # the second seed's half is gone below 4: 5.7, at most 4 and 5.7 are below 8 in the mean, [2.7, 7.5]
+        ({4.0: [0.9, 0.3, 0.9], 8.0: [0.1, 0.05, 0.1]}, "holds", "5.7, below 4, 5.7 (seed by seed)"),
+        ({4.0: [0.3, 0.3, 0.3], 8.0: [0.1, 0.1, 0.1]}, "holds", "below 4, below 4, below 4 (seed by seed)"),
+        # one seed needs more than was tried
+        ({4.0: [0.9, 0.9, 0.9], 8.0: [0.1, 0.1, 0.9]}, "open", "5.7, 5.7, above 8 (seed by seed)"),
+        ({4.0: [0.9, 0.9, 0.9], 16.0: [0.9, 0.9, 0.9]}, "does not hold", "above 16, above 16, above 16 (seed by seed)"),
+        # below the smallest says nothing of a bound that is smaller still
+        ({12.0: [0.3, 0.3, 0.3], 16.0: [0.1, 0.1, 0.1]}, "open", "below 12, below 12, below 12 (seed by seed)"),
+        ({4.0: [0.3, 0.9, 0.9], 16.0: [0.1, 0.9, 0.9]}, "open", "below 4, above 16, above 16 (seed by seed)"),
+        ({4.0: [0.3]}, "one seed: yes", "below 4 (seed by seed)"),
+        ({16.0: [0.9]}, "one seed: no", "above 16 (seed by seed)"),
+        ({16.0: [0.3]}, "open", "below 16 (seed by seed)"),
+    ],
+)
+def test_half_of_the_skill_gone_below_w_is_asked_of_every_seed(skills, word, evidence):
+    document = {"results": {"variants": swept(skills)}}
+    (found,) = penalty.findings(document)
+    assert found.word == word
+    assert found.evidence.startswith(f"half of the skill on the targets is gone at λ = {evidence}; bound 8; λ_crit on")
+    if len(skills[next(iter(skills))]) == 3:
+        assert found.evidence.endswith("λ_crit on the base's steps 7.70 [7.45, 7.95]")
+
+
+def test_half_of_the_skill_is_gone_between_two_penalties_before_the_first_or_after_the_last():
+    crossed = 8.0 * 2.0 ** (0.2 / 0.6)
+    assert penalty.half_gone({16.0: 0.1, 4.0: 0.9, 8.0: 0.7}) == pytest.approx((crossed, crossed))
+    assert penalty.half_gone({4.0: 0.3, 8.0: 0.7, 16.0: 0.1}) == (0.0, 4.0)
+    assert penalty.half_gone({4.0: 0.5}) == (0.0, 4.0)
+    assert penalty.half_gone({4.0: 0.9, 16.0: 0.6}) == (16.0, math.inf)
+
+
+def test_wear_is_what_the_kept_clips_lose_of_their_start():
+    def found(end: list[float]):
+        groups = [{"kept": {"survival_weighted_tracking": over_seeds(of)}} for of in ([0.8, 0.8, 0.8], [0.1] * 3, end)]
+        (one,) = heat_map.findings({"asked": {"iterations": 1000}, "results": {"groups": groups}})
+        return one
+
+    assert found([0.78, 0.79, 0.80]).word == "holds"
+    assert found([0.5, 0.51, 0.52]).word == "does not hold"
+    assert found([0.7, 0.8, 0.75]).word == "open"
+    assert found([0.7, 0.8, 0.75]).claim == "the kept clips are not worn down after 1,000 iterations"
+
+
+def test_any_motion_is_forgotten_and_the_others_stay():
+    runs = {
+        "run": variant([0.0, 0.0, 0.0], [0.4, 0.41, 0.42], skill=[0.1, 0.12, 0.11]),
+        "dance": variant([0.0, 0.0, 0.0], [0.6, 0.6, 0.6], skill=[0.5, 0.52, 0.51]),
+    }
+    found = targets.findings({"asked": {"robot": "g1"}, "results": {"variants": runs}})
+    assert words(found) == {
+        "run: forgotten on the G1": "holds",
+        "run: the kept clips stay as they were": "does not hold",
+        "dance: forgotten on the G1": "does not hold",
+        "dance: the kept clips stay as they were": "holds",
+    }
+
+
+@pytest.mark.parametrize(
+    ("auc", "hits", "expected"),
+    [
+        ([0.9, 0.92, 0.91], [0.9, 0.9, 0.91], ["does not hold", "does not hold"]),
+        ([0.1, 0.12, 0.11], [0.0, 0.0, 0.0], ["does not hold", "holds"]),  # marked by having been forgotten
+        ([0.4, 0.5, 0.6], [0.0, 0.1, 0.05], ["open", "open"]),
+        ([0.4, 0.5, 0.6], [0.2, 0.21, 0.22], ["open", "does not hold"]),
+        ([0.9], [0.9], ["open", "one seed: no"]),
+    ],
+)
+def test_membership_shows_in_the_auc_on_either_side_and_in_the_hits(auc, hits, expected):
+    of = {"auc": over_seeds(auc), "tpr_at_5_percent_fpr": over_seeds(hits)}
+    asked = {"targets": ["punch", "kick"], "episodes": 20}
+    found = list(membership.findings({"asked": asked, "results": {"policies": {"λ = 16": of}}}))
+    assert [one.word for one in found] == expected
+    assert [one.main for one in found] == [True, False]
+    assert found[1].evidence.endswith("guessing 0.07")  # of 41 alike, one is among the first three in 3 of 41 cases
+
+
+def curve(at: int, first: float = 0.1) -> dict:
+    """Tracking of 0.9 from iteration `at` on, 0.1 before, `first` at the start; 100 target steps an iteration."""
+    tracking = [first, *(0.9 if step >= at else 0.1 for step in range(1, 6))]
+    return {"iterations": list(range(6)), "target_steps": [100.0 * step for step in range(6)], "tracking": tracking}
+
+
+def relearned(unlearned: list[int], distilled: list[int]) -> list:
+    starts = {
+        label: {str(seed): curve(at) for seed, at in enumerate(of)}
+        for label, of in (("unlearned", unlearned), ("distilled", distilled))
+    }
+    return list(relearning.findings({"results": {"base": dict.fromkeys("012", 0.9), "starts": starts}}))
+
+
+@pytest.mark.parametrize(
+    ("unlearned", "distilled", "word"),
+    [
+        ([1, 2, 1], [4, 4, 4], "does not hold"),
+        ([3, 4, 3], [1, 1, 1], "holds"),
+        ([1, 2, 1], [1, 1, 4], "open"),
+        ([1, 2, 1], [4, 9, 9], "does not hold"),  # later than their runs' ends, which is late enough
+        ([1, 9, 1], [4, 4, 4], "open"),
+        ([9, 9, 9], [1, 2, 1], "holds"),  # never, where the control gets there
+        ([9, 9, 9], [9, 9, 9], "open"),
+        ([4], [1], "one seed: yes"),
+        ([4], [9], "one seed: no"),
+        ([9], [4], "one seed: yes"),
+        ([9], [9], "open"),
+    ],
+)
+def test_what_comes_back_sooner_than_it_is_learned_was_not_forgotten(unlearned, distilled, word):
+    found = relearned(unlearned, distilled)
+    assert len(found) == len(relearning.SHARES)
+    assert {one.word for one in found} == {word}
+    assert [one.main for one in found] == [False, True, False]
+
+
+def test_the_evidence_of_relearning_names_the_steps_and_who_never_got_there():
+    assert relearned([1, 2, 1], [4, 4, 4])[0].evidence == (
+        "target steps until 50 %, unlearned minus distilled -267 [-410, -123]; bound 0; distilled 400"
+    )
+    assert relearned([1, 2, 1], [4, 9, 9])[0].evidence.endswith("; distilled never got there in 2 of 3 runs")
+
+
+@pytest.mark.parametrize("unlearned", [1, 2, 3, 9])
+@pytest.mark.parametrize("control", [1, 3, 4, 9])
+def test_the_study_says_nothing_against_the_verdicts_rule(unlearned, control):
+    def lasted(at: int) -> Lasted:
+        return Lasted(min(at, 5), 100.0 * min(at, 5), at <= 4)
+
+    sooner = _sooner(lasted(unlearned), lasted(control))  # by half, for the verdict
+    word = relearned([unlearned], [control])[1].word
+    assert (sooner, word) not in {(True, "one seed: yes"), (False, "open")}
+    if word == "one seed: yes":
+        assert sooner is False
+    if sooner:
+        assert word == "one seed: no"
+
+
+def test_relearning_is_compared_with_every_control_and_says_which_one_starts_near_the_level():
+    def seeds(at: int, first: float) -> dict:
+        return {str(seed): curve(at, first) for seed in range(3)}
+
+    starts = {"unlearned": seeds(2, 0.1), "distilled": seeds(3, 0.4), "fresh": seeds(4, 0.09)}
+    found = list(relearning.findings({"results": {"base": dict.fromkeys("012", 0.9), "starts": starts}}))
+    assert [of.word for of in found] == ["the control starts near it", *["does not hold"] * 5]
+    assert (found[0].p, found[0].main) == (None, False)
+    assert found[0].evidence.endswith(", and starts at 44 %")
+    assert "than a fresh policy needs" in found[3].claim
+    del starts["fresh"]["0"]["iterations"][0]
+    first = relearning.at_first({"base": dict.fromkeys("012", 0.9), "starts": starts}, "fresh")
+    assert first == {"1": pytest.approx(0.1), "2": pytest.approx(0.1)}
