@@ -84,6 +84,8 @@ def _accepted(hint: Any) -> str:
         case builtins.tuple, (item, *others):
             count = "" if others == [...] else f" {len(others) + 1}"
             return f"a list of{count}: {_accepted(item)}"
+        case builtins.dict, (_, value):
+            return f"a table of: {_accepted(value)}"
         case _, (first, *_):  # first | None
             return _accepted(first)
-    return {bool: "true or false", str: "text"}.get(hint, "a table of settings")
+    return {bool: "true or false", float: "a number", str: "text"}.get(hint, "a table of settings")

@@ -32,8 +32,12 @@ def find_method(name: str) -> Method:
 
 
 def method_of(config: Config) -> Method:
-    """How a run trains: by its method if it has clips to forget, else by plain PPO."""
-    return find_method(config.unlearn.method) if config.unlearn.targets else Method()
+    """How a run trains: by its method if it has clips to forget, else by plain PPO.
+
+    Raises:
+        InputError: an unknown method, or a setting that the method does not have.
+    """
+    return _checked(config.unlearn) if config.unlearn.targets else Method()
 
 
 def unlearning_config(base: Config, unlearn: UnlearnConfig) -> Config:
@@ -45,12 +49,7 @@ def unlearning_config(base: Config, unlearn: UnlearnConfig) -> Config:
     Raises:
         InputError: an unknown method, or a setting that the method does not have.
     """
-    method = find_method(unlearn.method)
-    for name in unlearn.settings:
-        if name not in method.settings:
-            raise InputError(
-                f"unlearn.settings: {unlearn.method} has no setting '{name}'; {nearest(name, method.settings)}"
-            )
+    method = _checked(unlearn)
     unlearn = dataclasses.replace(unlearn, settings={**method.settings, **unlearn.settings})
     sampling = dataclasses.replace(base.sampling, clips=method.clips, target_share=0.0)  # which a base may have had
     wrench = base.wrench
@@ -58,3 +57,14 @@ def unlearning_config(base: Config, unlearn: UnlearnConfig) -> Config:
         sampling = dataclasses.replace(sampling, rule="uniform_clips")
         wrench = dataclasses.replace(wrench, max_gain=0.0)
     return dataclasses.replace(base, unlearn=unlearn, sampling=sampling, wrench=wrench)
+
+
+def _checked(unlearn: UnlearnConfig) -> Method:
+    """The method, which has every setting that is given for it."""
+    method = find_method(unlearn.method)
+    for name in unlearn.settings:
+        if name not in method.settings:
+            raise InputError(
+                f"unlearn.settings: {unlearn.method} has no setting '{name}'; {nearest(name, method.settings)}"
+            )
+    return method

@@ -199,6 +199,10 @@ def test_a_preset_brings_its_settings_but_keeps_the_base_s_network(options, base
         ({"penalty": -16.0}, "unlearn.settings.penalty: found -16.0; accepted: a number above 0"),
         ({"penalty": float("nan")}, "unlearn.settings.penalty: found nan; accepted: a number above 0"),
         ({"penalty": float("inf")}, "unlearn.settings.penalty: found inf; accepted: a number above 0"),
+        (
+            {"set": [["unlearn.settings.penalt=3"]]},
+            "unlearn.settings: arft has no setting 'penalt'; did you mean 'penalty'?",
+        ),
         ({"episodes": 0}, "--episodes: found 0; accepted: 1 or more"),
         ({"iterations": 0}, "iterations: found 0; accepted: a whole number from 1"),
         ({"iterations": -1}, "iterations: found -1; accepted: a whole number from 1"),

@@ -128,6 +128,10 @@ def test_the_hash_does_not_see_how_long_or_how_often(name):
         ({"unlearn": {"targets": "punch"}}, "here: unlearn.targets: found 'punch'; accepted: a list of: text"),
         ({"library": 5}, "here: library: found 5; accepted: text"),
         (
+            {"unlearn": {"settings": {"penalty": "high"}}},
+            "here: unlearn.settings: found {'penalty': 'high'}; accepted: a table of: a number",
+        ),
+        (
             {"noise": {"push_interval": [1.0]}},
             "here: noise.push_interval: found [1.0]; accepted: a list of 2: a number from 0",
         ),
