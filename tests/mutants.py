@@ -299,6 +299,7 @@ def main(arguments: list[str] | None = None) -> int:
         outdated = {mutant: told for mutant in chosen if (told := misfit(mutant, ROOT))}
         console.print(table({mutant: outdated.get(mutant, "") for mutant in chosen}))
         return 1 if outdated else 0
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the copy is removed and the tests end
     with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
         tree = Path(folder) / "copy"
         shutil.copytree(ROOT, tree, ignore=LEFT_OUT)
