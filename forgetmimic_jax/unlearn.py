@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 
 from forgetmimic_jax.basics.errors import InputError, run_command
-from forgetmimic_jax.settings.config import UnlearnConfig
 from forgetmimic_jax.settings.options import at_least, parse
 from forgetmimic_jax.training.unlearning_run import Options, config_of
 
@@ -34,12 +33,11 @@ def main(options: Options) -> None:
     base = base_policy(setup)
     setup = dataclasses.replace(setup, base=base)
     info = checkpoint.read_info(base_checkpoint(config))
-    description = f"forget {', '.join(config.unlearn.targets)}"
     method = method_of(config)
     if method.result == "fine_tuned" and config.sampling.clips == "all":
         description = "fine-tune on all clips"  # which is no forgetting
-    elif config.unlearn.method != UnlearnConfig.method:
-        description += f" by {config.unlearn.method}"
+    else:
+        description = f"forget {', '.join(config.unlearn.targets)} by {config.unlearn.method}"
     path, state = run(setup, output, description=description, resume=options.resume)
     try:
         document = evaluate(

@@ -1,4 +1,4 @@
-"""What a user asks of an unlearning run, and the settings that follow from it.
+"""The flags of an unlearning run, and the settings that follow from them.
 
 The command `unlearn` runs it, and the studies make many of them.
 """
@@ -67,13 +67,13 @@ class Options:
     output: Path | None = None
     """Folder of the run; the next free runs/unlearn-ROBOT-NUMBER by default."""
     resume: bool = False
-    """Go on from the newest checkpoint in the output folder (by default the newest run), with its settings."""
+    """Continue from the newest checkpoint in the output folder (by default the newest run), with its settings."""
     set: Settings = field(default_factory=list)
     """Any other settings, such as ppo.learning_rate=1e-4."""
 
 
 def config_of(options: Options, output: Path | None = None) -> Config:
-    """Every setting of a run as the options ask for it; with `resume`, of the run in folder `output`."""
+    """Every setting of a run; with `resume`, those of the run in folder `output`."""
     config = _config_of_run(options, output) if options.resume and output else config_of_new_run(options)
     config = override(replace_given(config, iterations=options.iterations), itertools.chain(*options.set))
     return on_engine(config, options.physics)
@@ -91,8 +91,8 @@ def config_of_new_run(options: Options) -> Config:
     config = dataclasses.replace(config, base=None, evaluate_every=0)
     config = replace_given(config, robot=options.robot, seed=options.seed, library=options.library, base=options.base)
     targets = default_targets(config) if options.targets is None else comma_separated(options.targets)
-    unlearn = UnlearnConfig(targets=targets, penalty=options.penalty, method=options.method)
-    config = unlearning_config(config, unlearn)
+    settings = {} if options.penalty is None else {"penalty": options.penalty}
+    config = unlearning_config(config, UnlearnConfig(targets, options.method, settings))
     pace = find_method(options.method).pace
     config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, **pace.ppo.get(config.preset, {})))
     sampling = replace_given(config.sampling, rule=options.sampler, clips=options.clips)
@@ -128,6 +128,7 @@ def _config_of_run(options: Options, output: Path) -> Config:
         options = dataclasses.replace(options, targets=",".join(comma_separated(options.targets)))
     check_same(options, {name: getattr(config, name) for name in ("robot", "preset", "seed", "library", "base")})
     unlearn, sampling = config.unlearn, config.sampling
-    check_same(options, {"targets": ",".join(unlearn.targets), "penalty": unlearn.penalty, "method": unlearn.method})
+    check_same(options, {"targets": ",".join(unlearn.targets), "method": unlearn.method})
+    check_same(options, {"penalty": unlearn.settings.get("penalty")})
     check_same(options, {"sampler": sampling.rule, "clips": sampling.clips, "wrench": config.wrench.max_gain > 0})
     return config
