@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from typing import TypedDict
 
 import numpy as np
-from scipy import stats
 
 CONFIDENCE = 0.95
 RESAMPLES = 2000
@@ -84,6 +83,8 @@ def rate(successes: int, n: int) -> Estimate:
 
     Over clips of unequal difficulty the interval errs on the wide side.
     """
+    from scipy import stats  # half a second, which a command's --help does not wait for
+
     interval = stats.binomtest(successes, n).proportion_ci(confidence_level=CONFIDENCE, method="exact")
     share = successes / n
     return estimate(share, interval.low, interval.high, np.sqrt(share * (1.0 - share)), n)
@@ -91,6 +92,8 @@ def rate(successes: int, n: int) -> Estimate:
 
 def over_seeds(values: Sequence[float] | np.ndarray) -> Estimate:
     """Mean over training seeds with Student's t interval; one seed has no interval."""
+    from scipy import stats  # half a second, which a command's --help does not wait for
+
     values = np.asarray(values, dtype=np.float64)
     n, mean = len(values), float(np.mean(values))
     if n == 1:
