@@ -23,7 +23,7 @@ def flags_of(subject: Subject, base: Path | None) -> dict[str, Any]:
         "robot": config.robot,
         "targets": ",".join(config.unlearn.targets),
         "method": config.unlearn.method,
-        **config.unlearn.settings,
+        "penalty": config.unlearn.settings.get("penalty"),
         "iterations": config.iterations,
         "seed": config.seed,
         "base": base or (None if config.base is None else Path(config.base)),

@@ -144,7 +144,7 @@ def base(tmp_path) -> Path:
 
 
 def test_a_trials_folder_says_what_it_is_and_its_flags_make_its_settings(tmp_path, base):
-    found = make_trial(tmp_path, {"base": base, "iterations": 5, "penalty": 16.0, "seed": 2, "method": "arft"})
+    found = make_trial(tmp_path, {"base": base, "iterations": 5, "seed": 2, "method": "arft"})
     assert re.fullmatch(rf"arft-punch\+kick-s2-[0-9a-f]{{8}}-{provenance().code}", found.folder.name)
     assert found.flags == ("--iterations", "5", "--seed", "2", "--base", str(base))
     asked = {"base": base, "iterations": 5, "penalty": 8.0, "wrench": True, "sampler": None, "targets": "run, walk"}
@@ -152,7 +152,7 @@ def test_a_trials_folder_says_what_it_is_and_its_flags_make_its_settings(tmp_pat
     assert other.folder.name.startswith("arft-run+walk-s0-")
     assert without_code(other.folder.name) + f"-{provenance().code}" == other.folder.name
     config = other.config
-    assert (config.unlearn.penalty, config.ppo.base_kl, config.ppo.epochs) == (8.0, 0.5, 7)
+    assert (config.unlearn.settings, config.ppo.base_kl, config.ppo.epochs) == ({"penalty": 8.0}, 0.5, 7)
     assert (config.iterations, other.iterations, config.physics.engine) == (5, 5, "native")
     assert config.wrench.max_gain > 0.0
     for trial in (found, other):  # what the process makes of the flags is the trial's config
