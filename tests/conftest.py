@@ -15,7 +15,8 @@ from forgetmimic_jax.settings.config import Config, preset
 from forgetmimic_jax.tracking.setup import Setup
 
 # Compiling is most of what the tests wait for; this makes it three times as fast. JAX reads it when it first starts.
-os.environ["XLA_FLAGS"] += " --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+QUICK_COMPILATION = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICK_COMPILATION}".strip()
 
 # As under `make test`, also without make: what a command says to do next is then a target of make.
 os.environ["MAKELEVEL"] = "1"

@@ -2,6 +2,8 @@
 
 import contextlib
 import faulthandler
+import itertools
+import re
 import sys
 
 import jax
@@ -108,8 +110,41 @@ def test_a_diverged_row_is_not_finite_and_alone(step, inputs, result):
     assert np.isnan(diverged[0].qpos[FLIGHT]).any()
 
 
+@pytest.mark.skipif(has_gpu(), reason="a GPU does not call LAPACK")
+def test_no_two_calls_of_lapack_can_run_at_once(step):
+    """On two cores the two would wait for each other forever: see `physics.mjx._step`."""
+    graphs = lapack_graphs(step.as_text())
+    assert max(map(len, graphs)) == 10  # three factorisations, two triangular solutions of each, the solver's loop
+    for calls in graphs:
+        for first, second in itertools.combinations(calls, 2):
+            assert first in calls[second] or second in calls[first], f"nothing orders {first} and {second}"
+
+
+def lapack_graphs(hlo: str) -> list[dict[str, set[str]]]:
+    """Of each computation of a compiled program, the instructions that call LAPACK, or a computation that does.
+
+    Each comes with the names of all instructions that it waits for.
+    """
+    header, instruction = (
+        re.compile(r"^(?:ENTRY )?%?([\w.-]+) \(.*\{$"),
+        re.compile(r"^\s+(?:ROOT )?%?([\w.-]+) = (.*)$"),
+    )
+    graphs: dict[str, dict[str, set[str]]] = {}
+    for line in hlo.splitlines():
+        if found := header.match(line):
+            waits_for: dict[str, set[str]] = {}
+            calls = graphs[found[1]] = {}
+        elif found := instruction.match(line):
+            name, rest = found[1], found[2].partition(", metadata=")[0]
+            words = re.findall(r"[\w.-]+", rest)
+            operands = waits_for.keys() & set(words)
+            waits_for[name] = operands.union(*(waits_for[operand] for operand in operands))
+            if "lapack_" in rest or any(graphs.get(word) for word in words):  # a computation stands before its callers
+                calls[name] = waits_for[name]
+    return list(graphs.values())
+
+
 def test_many_steps_on_a_cpu_end(step, inputs, result):
-    """The hang came and went with XLA's defaults: see the flag in the package's __init__."""
     state = inputs.state
     with no_hang():
         for _ in range(20):
