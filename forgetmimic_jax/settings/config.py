@@ -182,7 +182,7 @@ class UnlearnConfig:
 
     targets: tuple[str, ...] = ()
     method: str = "arft"  # a module of forgetmimic_jax.unlearning
-    settings: dict[str, float] = field(default_factory=dict, hash=False)  # the method's own, such as the penalty λ of arft
+    settings: dict[str, float] = field(default_factory=dict, hash=False)  # the method's own, such as λ of arft
 
 
 @dataclass(frozen=True)
