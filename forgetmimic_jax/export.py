@@ -68,12 +68,10 @@ def main(options: Options) -> None:
     config = on_engine(replace_given(info.config, robot=options.robot, library=options.library), "native")
     setup = make_setup(config)
     checkpoint.check_matches(info, setup, other_library=True)
-    policy = checkpoint.load_policy(info)
+    policy = checkpoint.load_policy(info, setup.robot)
 
     run_path = f"{info.robot}/{checkpoint.policy_hash(info)}"
-    content = to_onnx(
-        policy, setup.robot, run_path=run_path, control_step=config.physics.control_step
-    ).SerializeToString()
+    content = to_onnx(policy, setup.robot, config, run_path=run_path).SerializeToString()
     evaluator = Evaluator(setup, episodes=options.episodes, seed=options.seed)
     start = evaluator.start()
     with progress("run the ONNX in MuJoCo", len(evaluator.clip)) as report:

@@ -64,6 +64,7 @@ def main(options: Options) -> None:
     from forgetmimic_jax.robot.model import load_robot
     from forgetmimic_jax.settings.config import preset
     from forgetmimic_jax.tracking.env import make_assets
+    from forgetmimic_jax.tracking.layouts import find_layout
     from forgetmimic_jax.tracking.rsi import initial_failure_level
     from forgetmimic_jax.tracking.setup import make_setup
     from forgetmimic_jax.training import checkpoint
@@ -80,10 +81,10 @@ def main(options: Options) -> None:
     if suffix not in READERS:
         raise InputError(f"{options.policy}: suffix: found '{suffix}'; accepted: {', '.join(READERS)}")
     is_onnx = suffix == ".onnx"
-    actor = read_onnx(options.policy, robot) if is_onnx else read_rsl_rl(options.policy, options.activation)
-    check_actor(actor, robot, options.policy)
-
     config = replace_given(preset(options.preset), robot=options.robot, library=options.library, seed=options.seed)
+    actor = read_onnx(options.policy, robot, config) if is_onnx else read_rsl_rl(options.policy, options.activation)
+    check_actor(actor, find_layout(config.observation.layout), robot, options.policy)
+
     config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, actor_layers=actor.hidden_layers))
     setup = make_setup(config)
     assets = make_assets(setup)
@@ -120,25 +121,13 @@ def main(options: Options) -> None:
 def _observations(setup: Setup, seed: int) -> Array:
     """Actor observations [n, features] all along every clip, the robot on the reference but for the reset noise."""
     import jax
-    import jax.numpy as jnp
-    import numpy as np
 
-    from forgetmimic_jax.evaluation.rollout import episode_starts
-    from forgetmimic_jax.tracking.observation import actor_observation
-    from forgetmimic_jax.tracking.randomise import reset_state
-    from forgetmimic_jax.tracking.reference import lookup
+    from forgetmimic_jax.evaluation.rollout import Evaluator
+    from forgetmimic_jax.tracking.env import make_assets, make_environment, observe
 
-    starts = episode_starts(np.asarray(setup.library.length), OBSERVATIONS, seed)
-    clip, frame = (jnp.asarray(index, jnp.int32) for index in starts)
-
-    @jax.jit
-    def observe(robot, library, key):
-        reference = lookup(library, clip, frame)
-        physics = reset_state(setup.config.noise, robot, reference, setup.robot.root, key)
-        last_action = jnp.zeros_like(reference.joint_pos)
-        return actor_observation(robot, lookup(library, clip, frame + 1), setup.robot.root, physics, last_action)
-
-    return observe(setup.robot.arrays, setup.library, jax.random.PRNGKey(seed))
+    evaluator = Evaluator(setup, episodes=OBSERVATIONS, seed=seed)
+    env = make_environment(setup, len(evaluator.clip), noisy=False)
+    return jax.jit(lambda assets, state: observe(env, assets, state, None)[0])(make_assets(setup), evaluator.start())
 
 
 if __name__ == "__main__":

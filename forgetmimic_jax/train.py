@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,7 +29,8 @@ class Options:
     library: Path | None = None
     """Folder of clips; data/ROBOT by default."""
     base: Path | None = None
-    """Checkpoint whose policy to start from, another robot's too; a random policy by default."""
+    """Checkpoint whose policy to start from, another robot's too, with its observation layout; a random policy by
+    default."""
     output: Path | None = None
     """Folder of the run; runs/train-ROBOT by default."""
     resume: bool = False
@@ -42,6 +44,7 @@ def main(options: Options) -> None:
     from forgetmimic_jax.basics.console import closing, command_line
     from forgetmimic_jax.settings.config import load_config, preset
     from forgetmimic_jax.tracking.setup import make_setup
+    from forgetmimic_jax.training.checkpoint import read_info
     from forgetmimic_jax.training.folder import BEST, prepare_folder
     from forgetmimic_jax.training.run import run
 
@@ -58,6 +61,8 @@ def main(options: Options) -> None:
             library=options.library,
             base=options.base,
         )
+        if options.base:
+            config = dataclasses.replace(config, observation=read_info(options.base).config.observation)
     config = override(replace_given(config, iterations=options.iterations), itertools.chain(*options.set))
     setup = make_setup(on_engine(config, options.physics))
     path, _ = run(setup, output, description=f"train {config.robot}", resume=options.resume)

@@ -1,8 +1,7 @@
 """An exported policy at work in plain MuJoCo: one robot, sensors, onnxruntime, PD targets. No JAX in the loop.
 
-What a deploy tool does, written with nothing but numpy and MuJoCo and the ONNX file's own metadata, so that a mistake
-in the export, or in the environment it was trained in, shows. What the robot did is judged afterwards by the tracking
-reward and the terminations of the evaluation.
+What the policy sees and what its actions ask for is worked out by `exchange.deployed`, from the file's own metadata.
+What the robot did is judged afterwards by the tracking reward and the terminations of the evaluation.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ import mujoco
 import numpy as np
 
 from forgetmimic_jax.evaluation.metrics import Rollout
+from forgetmimic_jax.exchange.deployed import Deployed
 from forgetmimic_jax.exchange.onnx_actor import OnnxActor
 from forgetmimic_jax.motion.library import Frames, MotionLibrary
 from forgetmimic_jax.physics import BodyState
@@ -27,7 +27,6 @@ from forgetmimic_jax.tracking.env import EnvState
 from forgetmimic_jax.tracking.reference import align_to_anchor, lookup
 from forgetmimic_jax.tracking.termination import terminations
 
-DOWN = np.array([0.0, 0.0, -1.0])
 _BODIES = ("pos", "quat", "lin_vel", "ang_vel", "contact_force")
 
 
@@ -61,12 +60,13 @@ def run_episodes(
     """
     reference = jax.tree.map(lambda values: np.asarray(values, np.float64), library.frames)
     clips, frames, horizons = (np.asarray(x) for x in (start.clip, start.frame, start.horizon))
+    deployed = Deployed(actor, robot)
     episodes: list[dict[str, np.ndarray]] = []
     for clip, frame, horizon, qpos, qvel in zip(
         clips, frames, horizons, np.asarray(start.physics.qpos), np.asarray(start.physics.qvel), strict=True
     ):
         ahead = jax.tree.map(lambda values: values[clip, frame + 1 : frame + 1 + horizon], reference)  # noqa: B023
-        episodes.append(_run_episode(actor, robot, ahead, config.physics.substeps, qpos, qvel))
+        episodes.append(_run_episode(deployed, ahead, config.physics.substeps, qpos, qvel))
         report(len(episodes), sum(len(episode["action"]) for episode in episodes))
     steps = {name: np.concatenate([episode[name] for episode in episodes]) for name in episodes[0]}
     tracked = np.concatenate([frame + 1 + np.arange(horizon) for frame, horizon in zip(frames, horizons, strict=True)])
@@ -85,26 +85,27 @@ def run_episodes(
 
 
 def _run_episode(
-    actor: OnnxActor, robot: Robot, reference: Frames, substeps: int, qpos: np.ndarray, qvel: np.ndarray
+    deployed: Deployed, reference: Frames, substeps: int, qpos: np.ndarray, qvel: np.ndarray
 ) -> dict[str, np.ndarray]:
     """The states [step, ...] that the policy leads the robot through, and what it saw and did."""
-    model, data = robot.model, mujoco.MjData(robot.model)
+    model, data = deployed.model, mujoco.MjData(deployed.model)
     data.qpos[:], data.qvel[:] = qpos, qvel
-    scale, default = actor.numbers("action_scale"), actor.numbers("default_joint_pos")
-    forces = contact_sensor_columns(robot)
-    action = np.zeros(robot.num_joints, np.float32)
+    mujoco.mj_fwdPosition(model, data)
+    action = np.zeros(len(deployed.joints), np.float32)
+    key_bodies = deployed.robot.key_body_ids
+    forces = contact_sensor_columns(deployed.robot)
     steps = []
     for i in range(len(reference.joint_pos)):
         frame = jax.tree.map(lambda values: values[i], reference)  # noqa: B023
-        observation = _observe(data, frame, robot.root, default, action)
-        action = actor(observation)
-        data.ctrl[:] = frame.joint_pos + scale * action
+        observation = deployed.observation(data, frame, action)
+        action = deployed.actor(observation)
+        data.ctrl[:] = deployed.joint_target(frame, action)
         mujoco.mj_step(model, data, substeps)
         force = -data.sensordata[forces]
         mujoco.mj_fwdPosition(model, data)  # the bodies, where the last substep left the joints
         mujoco.mj_fwdVelocity(model, data)
-        velocity = np.zeros((len(robot.key_body_ids), 6))
-        for body, row in zip(robot.key_body_ids, velocity, strict=True):
+        velocity = np.zeros((len(key_bodies), 6))
+        for body, row in zip(key_bodies, velocity, strict=True):
             mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, body, row, 0)
         steps.append(
             {
@@ -112,43 +113,14 @@ def _run_episode(
                 "action": action,
                 "qpos": data.qpos.copy(),
                 "qvel": data.qvel.copy(),
-                "pos": data.xpos[robot.key_body_ids],
-                "quat": data.xquat[robot.key_body_ids],
+                "pos": data.xpos[key_bodies],
+                "quat": data.xquat[key_bodies],
                 "lin_vel": velocity[:, 3:],
                 "ang_vel": velocity[:, :3],
                 "contact_force": force,
             }
         )
     return {name: np.stack([step[name] for step in steps]).astype(np.float32) for name in steps[0]}
-
-
-def _observe(
-    data: mujoco.MjData, reference: Frames, root: int, default: np.ndarray, last_action: np.ndarray
-) -> np.ndarray:
-    """The actor's observation f32[features] from the robot's sensors and the frame to reach next."""
-    ref_quat = reference.bodies.quat[root]
-    return np.concatenate(
-        [
-            reference.bodies.pos[root, 2:],
-            _in_frame(ref_quat, reference.bodies.lin_vel[root]),
-            _in_frame(ref_quat, reference.bodies.ang_vel[root]),
-            _in_frame(ref_quat, DOWN),
-            reference.joint_pos,
-            data.qvel[3:6],
-            _in_frame(data.qpos[3:7], DOWN),
-            data.qpos[7:] - default,
-            data.qvel[6:],
-            last_action,
-        ]
-    ).astype(np.float32)
-
-
-def _in_frame(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """A world vector in the frame that `quat` turns into the world."""
-    inverse, result = np.zeros(4), np.zeros(3)
-    mujoco.mju_negQuat(inverse, quat)
-    mujoco.mju_rotVecQuat(result, vector, inverse)
-    return result
 
 
 def _judge(

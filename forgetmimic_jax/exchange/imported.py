@@ -15,7 +15,7 @@ from forgetmimic_jax.policy.gaussian import MAX_STD, MIN_STD
 from forgetmimic_jax.policy.normalizer import OBSERVATION_LIMIT, VARIANCE_FLOOR, Normalizer
 from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.robot.model import Robot
-from forgetmimic_jax.tracking.observation import actor_layout
+from forgetmimic_jax.tracking.layouts import Layout
 
 UNKNOWN_COUNT = 1e8  # observations behind statistics that do not say it: as many as the running ones ever remember
 RAW_SCALE = 10.0  # of observations that were not normalised: ours are clipped at ten of these
@@ -46,17 +46,16 @@ class ImportedActor:
         return tuple(kernel.shape[1] for kernel, _ in self.layers[:-1])
 
 
-def check_actor(actor: ImportedActor, robot: Robot, path: Path) -> None:
-    """Sizes that fit the robot and each other, and finite numbers.
+def check_actor(actor: ImportedActor, layout: Layout, robot: Robot, path: Path) -> None:
+    """Sizes that fit layout, robot and each other, and finite numbers.
 
     Raises:
         InputError: what differs, and what is needed.
     """
-    layout = actor_layout(robot.num_joints)
-    size = sum(layout.values())
+    size = layout.size(robot.num_joints)
     kernels = [kernel for kernel, _ in actor.layers]
     if kernels[0].shape[0] != size:
-        terms = ", ".join(f"{name} {width}" for name, width in layout.items())
+        terms = ", ".join(f"{term.name} {term.size(robot.num_joints)}" for term in layout.terms)
         raise InputError(
             f"{path}: observations: found {kernels[0].shape[0]}; {size} are needed, in this order: {terms}"
         )

@@ -19,22 +19,23 @@ from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.policy.normalizer import OBSERVATION_LIMIT, VARIANCE_FLOOR
 from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.robot.model import Robot
-from forgetmimic_jax.tracking.observation import actor_layout
+from forgetmimic_jax.settings.config import Config
+from forgetmimic_jax.tracking.layouts import find_layout
 
 INPUT, OUTPUT = "obs", "actions"
 OPSET, IR_VERSION = 13, 8  # old enough for the runtimes on robots
 
 
-def to_onnx(policy: Policy, robot: Robot, *, run_path: str, control_step: float) -> onnx.ModelProto:
-    """The actor's mean action as a model from `obs` [1, 16 + 4 joint] to `actions` [1, joint].
+def to_onnx(policy: Policy, robot: Robot, config: Config, *, run_path: str) -> onnx.ModelProto:
+    """The actor's mean action as a model from `obs` [1, features] to `actions` [1, joint].
 
     Args:
         policy: whose actor and normaliser are written.
         robot: for the metadata.
+        config: of the policy: its layout and control step.
         run_path: what the policy says it is.
-        control_step: s between two actions.
     """
-    normalizer, size = policy.actor_normalizer, sum(actor_layout(robot.num_joints).values())
+    normalizer = policy.actor_normalizer
     constants = {
         "mean": np.asarray(normalizer.mean),
         "scale": 1.0 / np.sqrt(np.asarray(normalizer.variance) + np.float32(VARIANCE_FLOOR)),
@@ -58,7 +59,7 @@ def to_onnx(policy: Policy, robot: Robot, *, run_path: str, control_step: float)
         nodes,
         "actor",
         # A batch of one, as deploy tools take the sizes of their buffers from here.
-        [helper.make_tensor_value_info(INPUT, TensorProto.FLOAT, [1, size])],
+        [helper.make_tensor_value_info(INPUT, TensorProto.FLOAT, [1, normalizer.mean.size])],
         [helper.make_tensor_value_info(OUTPUT, TensorProto.FLOAT, [1, robot.num_joints])],
         [numpy_helper.from_array(np.asarray(value, np.float32), name) for name, value in constants.items()],
     )
@@ -68,14 +69,15 @@ def to_onnx(policy: Policy, robot: Robot, *, run_path: str, control_step: float)
         ir_version=IR_VERSION,
         producer_name="forgetmimic-jax",
     )
-    helper.set_model_props(model, metadata(robot, run_path=run_path, control_step=control_step))
+    helper.set_model_props(model, metadata(robot, config, run_path=run_path))
     onnx.checker.check_model(model, full_check=True)
     return model
 
 
-def metadata(robot: Robot, *, run_path: str, control_step: float) -> dict[str, str]:
+def metadata(robot: Robot, config: Config, *, run_path: str) -> dict[str, str]:
     """What a deploy tool must know beside the weights. Numbers have all their digits, where mjlab rounds to three."""
-    arrays = robot.arrays
+    arrays, layout = robot.arrays, find_layout(config.observation.layout)
+    body = {"anchor": robot.anchor, "root": robot.root}[layout.body]
     return {
         "run_path": run_path,
         "policy_only_export": "true",
@@ -86,10 +88,10 @@ def metadata(robot: Robot, *, run_path: str, control_step: float) -> dict[str, s
         "default_joint_pos": _csv(np.asarray(arrays.default_joint_pos)),
         "action_scale": _csv(np.asarray(arrays.action_scale)),
         "command_names": "motion",
-        "observation_names": _csv(actor_layout(robot.num_joints)),
-        "anchor_body_name": robot.key_bodies[robot.anchor],
+        "observation_names": _csv(term.name for term in layout.terms),
+        "anchor_body_name": robot.key_bodies[body],  # whose motion the terms of the reference show
         "body_names": _csv(robot.key_bodies),
-        "step_dt": _csv([control_step]),
+        "step_dt": _csv([config.physics.control_step]),
     }
 
 
@@ -123,9 +125,13 @@ class OnnxActor:
         """Mean action f32[joint] at an observation [features]."""
         return self._session.run([OUTPUT], self._feed | {INPUT: observation[None].astype(np.float32)})[0][0]
 
+    def names(self, key: str) -> list[str]:
+        """A metadata list of names."""
+        return self.metadata[key].split(",")
+
     def numbers(self, key: str) -> np.ndarray:
         """A metadata list of numbers."""
-        return np.array([float(item) for item in self.metadata[key].split(",")])
+        return np.array([float(item) for item in self.names(key)])
 
 
 def _csv(items: Iterable[Any]) -> str:

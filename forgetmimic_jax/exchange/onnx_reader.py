@@ -16,6 +16,7 @@ from forgetmimic_jax.exchange.imported import ImportedActor
 from forgetmimic_jax.exchange.onnx_actor import INPUT, OUTPUT, metadata
 from forgetmimic_jax.policy.normalizer import OBSERVATION_LIMIT
 from forgetmimic_jax.robot.model import Robot
+from forgetmimic_jax.settings.config import Config
 
 METADATA_TOLERANCE = 2e-3  # mjlab writes three decimals
 
@@ -29,8 +30,13 @@ _AFFINE: dict[str, Callable] = {
 }
 
 
-def read_onnx(path: Path, robot: Robot) -> ImportedActor:
+def read_onnx(path: Path, robot: Robot, config: Config) -> ImportedActor:
     """The actor of an ONNX file: the chain of operations from the input `obs` to the output `actions`.
+
+    Args:
+        path: the file.
+        robot: that the policy must be for.
+        config: with the layout that the policy must see.
 
     Raises:
         InputError: not a model, other operations, or metadata that tell of another robot or observation.
@@ -41,7 +47,7 @@ def read_onnx(path: Path, robot: Robot) -> ImportedActor:
         raise InputError(f"{path}: no such file") from None
     except (DecodeError, onnx.checker.ValidationError, ValueError) as error:
         raise InputError(f"{path}: not a readable ONNX model: {str(error).splitlines()[0]}") from None
-    _check_metadata({entry.key: entry.value for entry in model.metadata_props}, robot, path)
+    _check_metadata({entry.key: entry.value for entry in model.metadata_props}, robot, config, path)
     chain = _Chain(model.graph, path)
     scale, shift = np.ones(1), np.zeros(1)
     layers: list[tuple[np.ndarray, np.ndarray]] = []
@@ -130,11 +136,11 @@ def _attribute(node: onnx.NodeProto, name: str, default: float) -> float:
     return next((onnx.helper.get_attribute_value(each) for each in node.attribute if each.name == name), default)
 
 
-def _check_metadata(told: dict[str, str], robot: Robot, path: Path) -> None:
+def _check_metadata(told: dict[str, str], robot: Robot, config: Config, path: Path) -> None:
     """What the file says of its robot must be so here. A file may say nothing."""
-    for key, here in metadata(robot, run_path="", control_step=0.0).items():
+    for key, here in metadata(robot, config, run_path="").items():
         there = told.get(key, here)
-        if key in ("joint_names", "observation_names", "action_mode") and there != here:
+        if key in ("joint_names", "observation_names", "anchor_body_name", "action_mode") and there != here:
             raise InputError(f"{path}: {key}: {_difference(there.split(','), here.split(','))}")
         if key in ("joint_stiffness", "joint_damping", "default_joint_pos", "action_scale"):
             _check_numbers(key, there, here, robot, path)

@@ -29,7 +29,7 @@ def collect(env: Environment, assets: Assets, state: TrainState, rule: Rule) -> 
 
     def observe(episodes: tracking.EnvState, key: Array) -> tuple[Array, Array]:
         actor_obs, critic_obs = tracking.observe(env, assets, episodes, key if env.noisy else None)
-        return rule.observation(actor_obs, assets.is_target[episodes.clip]), critic_obs
+        return rule.observation(config, actor_obs, assets.is_target[episodes.clip]), critic_obs
 
     def one_step(carry, key: Array):
         before, actor_obs, critic_obs = carry
@@ -87,6 +87,7 @@ def draw_states(env: Environment, assets: Assets, state: TrainState) -> tuple[Tr
         start_key, episode_key = jax.random.split(key)
         clip, start_bin, frame = sample_start(start_key, probabilities, assets.bins, env.num_envs)
         episodes = tracking.start_episodes(env, assets, episode_key, clip, start_bin, frame, no_gain)
+        episodes = tracking.refresh_bodies(env, episodes, jnp.ones((env.num_envs,), bool))
         actor_obs, critic_obs = tracking.observe(env, assets, episodes, None)
         mean, log_std = policy.distribution(actor_obs)
         return Transition(

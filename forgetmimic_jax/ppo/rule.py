@@ -17,7 +17,7 @@ def plain_reward(config: Config, reward: Reward, is_target: Array, key: Array) -
     return reward.tracking + reward.regularisation
 
 
-def plain_observation(observation: Array, is_target: Array) -> Array:
+def plain_observation(config: Config, observation: Array, is_target: Array) -> Array:
     """The actor's observation [env, features] as it is."""
     return observation
 
@@ -28,12 +28,12 @@ class Rule:
 
     Args:
         reward: (config, the step's parts [env], is_target bool[env], random key) → training reward [env], per second.
-        observation: (actor observation [env, features], is_target bool[env]) → what the actor sees in training.
+        observation: (config, actor observation [env, features], is_target bool[env]) → what the actor sees in training.
         loss: (config, batch, what the networks say now, iteration i32[]) → the loss [] to minimise and its parts.
         simulate: whether steps are simulated, or reference states with reset noise stand for them.
     """
 
     reward: Callable[[Config, Reward, Array, Array], Array] = plain_reward
-    observation: Callable[[Array, Array], Array] = plain_observation
+    observation: Callable[[Config, Array, Array], Array] = plain_observation
     loss: Callable[[Config, Batch, Prediction, Array], tuple[Array, dict[str, Array]]] = ppo_loss
     simulate: bool = True

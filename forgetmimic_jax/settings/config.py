@@ -55,6 +55,13 @@ class PhysicsConfig:
 
 
 @dataclass(frozen=True)
+class ObservationConfig:
+    """What the actor sees."""
+
+    layout: str = "wbc132"  # a name in `tracking.layouts.LAYOUTS`
+
+
+@dataclass(frozen=True)
 class RewardConfig:
     """Weights and scales (paper, table of reward terms); the kernel is exp(−κ e / σ²)."""
 
@@ -107,15 +114,7 @@ class NoiseConfig:
     torso_com: Vector = (0.025, 0.05, 0.05)  # m
     encoder_bias: Amount = 0.01  # rad
     foot_friction: Interval = (0.3, 1.5)  # drawn uniformly between
-    observation_reference_height: Amount = 0.01
-    observation_reference_linear_velocity: Vector = (0.1, 0.1, 0.05)
-    observation_reference_angular_velocity: Vector = (0.2, 0.2, 0.3)
-    observation_reference_gravity: Amount = 0.02
-    observation_reference_joints: Amount = 0.05
-    observation_gyro: Amount = 0.2
-    observation_gravity: Amount = 0.05
-    observation_joint_position: Amount = 0.01
-    observation_joint_velocity: Amount = 1.5
+    sensors: Amount = 1.0  # times the half-widths of the observation's terms, which the layout has
 
 
 @dataclass(frozen=True)
@@ -200,6 +199,7 @@ class Config:
     evaluate_episodes: Count = 6  # a clip in each of them: enough to see a trend, not to report
     max_episode_steps: Count = 500  # 10 s
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
+    observation: ObservationConfig = field(default_factory=ObservationConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
     termination: TerminationConfig = field(default_factory=TerminationConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)

@@ -280,7 +280,7 @@ class Lab:
         rolled = {}
         with progress("roll out", len(policies)) as report:
             for done, (key, path) in enumerate(policies.items(), start=1):
-                policy = None if path is None else checkpoint.load_policy(checkpoint.read_info(path))
+                policy = None if path is None else checkpoint.load_policy(checkpoint.read_info(path), setup.robot)
                 rolled[key] = evaluator.rollout(policy)
                 report(done, 0, {})
         return rolled, library.names

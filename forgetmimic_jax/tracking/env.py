@@ -22,6 +22,7 @@ from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.robot.model import Robot, RobotArrays
 from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking import observation, randomise, reward
+from forgetmimic_jax.tracking.layouts import Layout, Moment, find_layout
 from forgetmimic_jax.tracking.reference import align_to_anchor, anchor_between, lookup
 from forgetmimic_jax.tracking.reward import Pair
 from forgetmimic_jax.tracking.rsi import Bins, make_bins, sample_start
@@ -82,6 +83,11 @@ class Environment:
     engine: Engine  # lives a control step at a time; with the wrench a physics step
     num_envs: int
     noisy: bool  # reset noise, pushes, randomisation and observation noise
+
+    @property
+    def layout(self) -> Layout:
+        """What the actor sees."""
+        return find_layout(self.config.observation.layout)
 
     @property
     def control_step(self) -> float:
@@ -257,17 +263,22 @@ def _live(env: Environment, assets: Assets, state: EnvState, target: Array) -> t
 
 
 def observe(env: Environment, assets: Assets, state: EnvState, key: Array | None) -> tuple[Array, Array]:
-    """Actor observation [env, 16 + 4 joint] and critic observation [env, features]; noise on the actor's with a key."""
+    """Actor observation [env, features] and critic observation [env, features]; noise on the actor's with a key."""
     robot = env.robot
-    reference = lookup(assets.library, state.clip, state.frame + 1)
-    clean = observation.actor_observation(assets.robot, reference, robot.root, state.physics, state.last_action)
+    moment = Moment(
+        robot=assets.robot,
+        reference=lookup(assets.library, state.clip, state.frame + 1),
+        physics=state.physics,
+        bodies=state.bodies,
+        last_action=state.last_action,
+        anchor=robot.anchor,
+        root=robot.root,
+    )
+    clean = observation.actor_observation(env.layout, moment)
     wrench = assist(env, assets, state) if env.config.wrench.max_gain > 0 else jnp.zeros((env.num_envs, 6), jnp.float32)
     critic = observation.critic_observation(
         clean,
-        reference,
-        state.bodies,
-        robot.anchor,
-        robot.root,
+        moment,
         wrench=wrench / (assets.robot.mass * 9.81),
         wrench_gain=state.wrench_gain,
         phase=state.frame / assets.library.length[state.clip],
@@ -275,10 +286,7 @@ def observe(env: Environment, assets: Assets, state: EnvState, key: Array | None
     )
     if key is None:
         return clean, critic
-    joints = robot.num_joints
-    noise = observation.observation_noise(env.config.noise, key, env.num_envs, joints)
-    bias = jnp.pad(state.encoder_bias, ((0, 0), (16 + joints, 2 * joints)))
-    return clean + noise + bias, critic
+    return clean + observation.sensor_noise(env.layout, env.config.noise.sensors, key, state.encoder_bias), critic
 
 
 def _all_sane(tree, num_envs: int) -> Array:

@@ -1,102 +1,53 @@
 """What the actor and the critic see.
 
-The actor knows no clip's name and no global position; the critic is privileged.
-The reference shown is the frame that the next action is to reach.
+The actor sees the terms of its layout (`tracking.layouts`) and knows no clip's name; the critic is privileged. The
+reference shown is the frame that the next action is to reach.
 """
 
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from forgetmimic_jax.basics import rotation
-from forgetmimic_jax.motion.library import Frames
-from forgetmimic_jax.physics import BodyState, PhysicsState
 from forgetmimic_jax.robot.bodies import Bodies
-from forgetmimic_jax.robot.model import RobotArrays
-from forgetmimic_jax.settings.config import NoiseConfig
+from forgetmimic_jax.robot.model import Robot
+from forgetmimic_jax.tracking.layouts import Layout, Moment
 from forgetmimic_jax.tracking.randomise import symmetric
+from forgetmimic_jax.tracking.reward import TERMS as REWARD_TERMS
 
 
-def actor_layout(num_joints: int) -> dict[str, int]:
-    """Terms of the actor's observation in their order, name → size. The names are wbc-mjlab's for the same terms."""
-    return {
-        "ref_base_height": 1,
-        "ref_base_lin_vel_b": 3,
-        "ref_base_ang_vel_b": 3,
-        "ref_gravity_b": 3,
-        "ref_joint_pos": num_joints,
-        "base_ang_vel": 3,
-        "projected_gravity": 3,
-        "joint_pos": num_joints,
-        "joint_vel": num_joints,
-        "actions": num_joints,
-    }
+def actor_observation(layout: Layout, moment: Moment) -> Array:
+    """[env, features] the terms of a layout, without noise or encoder bias."""
+    return jnp.concatenate([term.values(moment) for term in layout.terms], axis=-1)
 
 
-def actor_size(num_joints: int) -> int:
-    """Size of the actor's observation: 132 for 29 joints."""
-    return sum(actor_layout(num_joints).values())
-
-
-def actor_observation(
-    robot: RobotArrays, reference: Frames, root: int, physics: PhysicsState, last_action: Array
-) -> Array:
-    """[env, 16 + 4 joint], without noise or encoder bias.
+def sensor_noise(layout: Layout, factor: float, key: Array, encoder_bias: Array) -> Array:
+    """What sensors add to an actor observation [env, features]: uniform noise, and the bias of the joint encoders.
 
     Args:
-        robot: constants.
-        reference: the frame to reach next.
-        root: index of the floating base among the key bodies.
-        physics: the robot's state.
-        last_action: [env, joint].
+        layout: with the half-width of each term's noise.
+        factor: times these half-widths.
+        key: of the noise.
+        encoder_bias: [env, joint] rad.
     """
-    ref_quat = reference.bodies.quat[:, root]
-    quat = physics.qpos[:, 3:7]
-    down = jnp.zeros_like(physics.qpos[:, :3]).at[:, 2].set(-1.0)
-    return jnp.concatenate(
-        [
-            reference.bodies.pos[:, root, 2:],
-            rotation.rotate_inverse(ref_quat, reference.bodies.lin_vel[:, root]),
-            rotation.rotate_inverse(ref_quat, reference.bodies.ang_vel[:, root]),
-            rotation.rotate_inverse(ref_quat, down),
-            reference.joint_pos,
-            physics.qvel[:, 3:6],
-            rotation.rotate_inverse(rotation.normalize(quat), down),
-            physics.qpos[:, 7:] - robot.default_joint_pos,
-            physics.qvel[:, 6:],
-            last_action,
-        ],
-        axis=-1,
-    )
+    num_envs, joints = encoder_bias.shape
+    widths = [np.broadcast_to(layout.sensor_noise[term.name], term.size(joints)) for term in layout.terms]
+    bias = [
+        encoder_bias if term.encoder else jnp.zeros((num_envs, term.size(joints)), jnp.float32) for term in layout.terms
+    ]
+    return symmetric(key, num_envs, factor * np.concatenate(widths)) + jnp.concatenate(bias, axis=-1)
 
 
-def observation_noise(config: NoiseConfig, key: Array, num_envs: int, num_joints: int) -> Array:
-    """Uniform sensor noise [env, 16 + 4 joint] in the actor's layout."""
-    joints = (num_joints,)
-    half_width = jnp.concatenate(
-        [
-            jnp.asarray([config.observation_reference_height]),
-            jnp.asarray(config.observation_reference_linear_velocity),
-            jnp.asarray(config.observation_reference_angular_velocity),
-            jnp.full((3,), config.observation_reference_gravity),
-            jnp.full(joints, config.observation_reference_joints),
-            jnp.full((3,), config.observation_gyro),
-            jnp.full((3,), config.observation_gravity),
-            jnp.full(joints, config.observation_joint_position),
-            jnp.full(joints, config.observation_joint_velocity),
-            jnp.zeros(joints),
-        ]
-    )
-    return symmetric(key, num_envs, half_width)
+def critic_size(layout: Layout, robot: Robot) -> int:
+    """Numbers in a critic observation: 20 of anchor, base, wrench and phase, and 33 of each key body."""
+    return layout.size(robot.num_joints) + 20 + len(REWARD_TERMS) + 33 * len(robot.key_bodies)
 
 
 def critic_observation(
     clean_actor: Array,
-    reference: Frames,
-    bodies: BodyState,
-    anchor: int,
-    root: int,
+    moment: Moment,
     *,
     wrench: Array,
     wrench_gain: Array,
@@ -110,16 +61,14 @@ def critic_observation(
     phase; the last tracking terms; contact forces of the key bodies as sign·log1p.
 
     Args:
-        clean_actor: [env, 16 + 4 joint].
-        reference: the frame to reach next.
-        bodies: the robot's key bodies.
-        anchor: index of the anchor among the key bodies.
-        root: index of the floating base among the key bodies.
+        clean_actor: [env, features] the actor's, without noise.
+        moment: robot and reference.
         wrench: [env, 6] N, N m.
         wrench_gain: [env] β.
         phase: [env] in [0, 1].
         terms: [env, term] kernels r_j of the last step, in the order of `reward.TERMS`.
     """
+    reference, bodies, anchor, root = moment.reference, moment.bodies, moment.anchor, moment.root
     pos, quat = bodies.pos[:, anchor], bodies.quat[:, anchor]
     ref_pos, ref_quat = reference.bodies.pos[:, anchor], reference.bodies.quat[:, anchor]
 

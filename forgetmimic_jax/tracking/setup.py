@@ -13,6 +13,7 @@ from forgetmimic_jax.motion.library import DATA_DIR, MotionLibrary, library_hash
 from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.robot.model import Robot, load_robot
 from forgetmimic_jax.settings.config import Config, validate
+from forgetmimic_jax.tracking.layouts import find_layout
 
 
 @dataclass(frozen=True)
@@ -30,9 +31,10 @@ def make_setup(config: Config) -> Setup:
     """Load what a config names.
 
     Raises:
-        InputError: a number that no run can work with, or an unknown robot, library or target.
+        InputError: a number that no run can work with, or an unknown layout, robot, library or target.
     """
     validate(config)
+    find_layout(config.observation.layout)
     if not jax.config.values["jax_compilation_cache_dir"]:
         jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "jax"))
     robot = load_robot(config.robot, config.physics)

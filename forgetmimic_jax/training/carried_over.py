@@ -14,20 +14,20 @@ from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.policy.normalizer import Normalizer
 from forgetmimic_jax.policy.policy import Policy, init_policy
 from forgetmimic_jax.robot.model import Robot, load_robot, relative_height
-from forgetmimic_jax.tracking.observation import actor_layout, actor_size
-from forgetmimic_jax.training.checkpoint import CheckpointInfo
+from forgetmimic_jax.tracking.layouts import Layout, find_layout
+from forgetmimic_jax.tracking.observation import critic_size
+from forgetmimic_jax.training.checkpoint import CheckpointInfo, load_policy
 
 Places = tuple[np.ndarray, np.ndarray]  # of the same things, for the source and for the target
 REMEMBERED = 1e6  # observations that the statistics carried over count for: the new robot's soon outweigh them
 
 
-def policy_for(robot: Robot, info: CheckpointInfo, policy: Policy) -> Policy:
-    """The policy of a checkpoint of another robot, carried over as a start for `robot`.
+def policy_for(robot: Robot, info: CheckpointInfo) -> Policy:
+    """The policy of a checkpoint of another robot, carried over as a start for `robot`, with the same layout.
 
     Args:
         robot: to be trained.
         info: of the other robot's checkpoint.
-        policy: of that checkpoint.
 
     Raises:
         InputError: the robots have no joint, or not as many key bodies, in common, or the source has changed.
@@ -41,13 +41,13 @@ def policy_for(robot: Robot, info: CheckpointInfo, policy: Policy) -> Policy:
         raise InputError(f"{path}: key_bodies: '{name}' has {found}; {needed} are needed, as '{robot.name}' has")
     if not shared_joints(source, robot)[0].size:
         raise InputError(f"{path}: joints: '{name}' has none that is called as one of '{robot.name}'")
-    size, old_size = actor_size(robot.num_joints), policy.actor_normalizer.mean.size
-    critic_size = policy.critic_normalizer.mean.size - old_size + size
-    key = jax.random.PRNGKey(info.config.seed)
-    return carried_over(policy, source, robot, init_policy(info.config.ppo, robot.num_joints, size, critic_size, key))
+    layout, key = find_layout(info.config.observation.layout), jax.random.PRNGKey(info.config.seed)
+    sizes = layout.size(robot.num_joints), critic_size(layout, robot)
+    fresh = init_policy(info.config.ppo, robot.num_joints, *sizes, key)
+    return carried_over(load_policy(info, source), layout, source, robot, fresh)
 
 
-def carried_over(policy: Policy, source: Robot, target: Robot, fresh: Policy) -> Policy:
+def carried_over(policy: Policy, layout: Layout, source: Robot, target: Robot, fresh: Policy) -> Policy:
     """`policy` of robot `source` as a start for `target`: inputs and outputs go with the joint they belong to, by name.
 
     A joint that only the target has starts unheard, its action at 0, which follows the reference; one that only the
@@ -56,16 +56,21 @@ def carried_over(policy: Policy, source: Robot, target: Robot, fresh: Policy) ->
 
     Args:
         policy: of the source.
+        layout: of what both see.
         source: robot of as many key bodies as the target, in the same roles.
         target: another robot.
         fresh: a random policy of the target, with the same hidden layers.
     """
-    joints, rows, output = shared_joints(source, target), _features(source, target), (np.arange(1), np.arange(1))
+    joints, rows, output = (
+        shared_joints(source, target),
+        _features(layout, source, target),
+        (np.arange(1), np.arange(1)),
+    )
     size, new_size = policy.actor_normalizer.mean.size, fresh.actor_normalizer.mean.size
     private = np.arange(policy.critic_normalizer.mean.size - size)  # of the critic alone
     critic_rows = (np.append(rows[0], size + private), np.append(rows[1], new_size + private))
     normalizers = (policy.actor_normalizer, policy.critic_normalizer)
-    means, critic_means = (_moved_means(normalizer.mean, source, target) for normalizer in normalizers)
+    means, critic_means = (_moved_means(normalizer.mean, layout, source, target) for normalizer in normalizers)
     actor, critic = policy.actor["params"], policy.critic["params"]
     log_std = np.full(target.num_joints, np.mean(actor["log_std"]), np.float32)
     log_std[joints[1]] = np.asarray(actor["log_std"])[joints[0]]
@@ -87,28 +92,29 @@ def shared_joints(source: Robot, target: Robot) -> Places:
     return tuple(np.array([robot.joint_names.index(name) for name in names], int) for robot in (source, target))  # type: ignore[return-value]
 
 
-def _features(source: Robot, target: Robot) -> Places:
+def _features(layout: Layout, source: Robot, target: Robot) -> Places:
     """The actor's observations that both robots have, as places among the source's and among the target's."""
-    layouts = [actor_layout(robot.num_joints) for robot in (source, target)]
-    places: list[list[np.ndarray]] = [[], []]
-    offsets = [0, 0]
-    for name, size in layouts[0].items():
-        of_joints = size == source.num_joints
-        for robot, joints in enumerate(shared_joints(source, target)):
-            places[robot].append(offsets[robot] + (joints if of_joints else np.arange(size)))
-            offsets[robot] += layouts[robot][name]
-    return np.concatenate(places[0]), np.concatenate(places[1])
+    result = []
+    for robot, joints in zip((source, target), shared_joints(source, target), strict=True):
+        places, every = layout.places(robot.num_joints), np.arange(layout.size(robot.num_joints))
+        parts = []
+        for term in layout.terms:
+            here = every[places[term.name]]
+            parts.append(here.reshape(-1, robot.num_joints)[:, joints].ravel() if term.per_joint else here)
+        result.append(np.concatenate(parts))
+    return result[0], result[1]
 
 
-def _moved_means(mean: Any, source: Robot, target: Robot) -> np.ndarray:
+def _moved_means(mean: Any, layout: Layout, source: Robot, target: Robot) -> np.ndarray:
     """Means of the source's observations, actor's first, for a robot of the target's height and default pose."""
-    layout = actor_layout(source.num_joints)
-    ends = dict(zip(layout, np.cumsum(list(layout.values())), strict=True))
-    means = np.array(mean)
-    means[: ends["ref_base_height"]] *= relative_height(target.model) / relative_height(source.model)
+    places, means = layout.places(source.num_joints), np.array(mean)
     ours, theirs = shared_joints(source, target)
     moved = np.asarray(source.arrays.default_joint_pos)[ours] - np.asarray(target.arrays.default_joint_pos)[theirs]
-    means[ends["joint_pos"] - source.num_joints + ours] += moved
+    for term in layout.terms:
+        if term.height:
+            means[places[term.name]] *= relative_height(target.model) / relative_height(source.model)
+        if term.encoder:
+            means[places[term.name]][ours] += moved  # a slice is a view, so this changes `means`
     return means
 
 

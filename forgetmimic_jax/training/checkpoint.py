@@ -30,13 +30,16 @@ from safetensors.numpy import load_file, save_file
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.policy.policy import Policy, init_policy
 from forgetmimic_jax.ppo.state import TrainState
+from forgetmimic_jax.robot.model import Robot
 from forgetmimic_jax.settings.config import Config, load_config, save_config, to_dict
+from forgetmimic_jax.tracking.layouts import find_layout
+from forgetmimic_jax.tracking.observation import critic_size
 from forgetmimic_jax.tracking.rsi import Bins
 from forgetmimic_jax.tracking.setup import Setup
 
 POLICY, RUN, CONFIG, META = "policy.safetensors", "run", "config.yaml", "meta.json"
 FAILURE_LEVEL = "failure_level"  # the tensor beside those of the policy
-SCHEMA = 2
+SCHEMA = 3
 
 
 @dataclass(frozen=True)
@@ -185,7 +188,7 @@ def check_matches(
     other_robot: bool = False,
     resume: bool = False,
 ) -> None:
-    """InputError where robot, joints, library or network of a checkpoint differ from the setup's.
+    """InputError where robot, joints, library, observation or network of a checkpoint differ from the setup's.
 
     Args:
         info: of the checkpoint.
@@ -215,7 +218,7 @@ def check_matches(
             f"{info.path}: library: the checkpoint's hash is {info.library_hash}, this library's {library_hash} "
             f"({difference or 'same clip names, other content'})"
         )
-    shaping = [("ppo", "actor_layers"), ("ppo", "critic_layers")]
+    shaping = [("observation", "layout"), ("ppo", "actor_layers"), ("ppo", "critic_layers")]
     if resume:
         shaping += [("ppo", "num_envs"), ("sampling", "bin_seconds")]
     theirs, ours = to_dict(info.config), to_dict(setup.config)
@@ -232,21 +235,37 @@ def policy_hash(info: CheckpointInfo) -> str:
     return info.files[POLICY][:16]
 
 
-def load_policy(info: CheckpointInfo) -> Policy:
+def load_policy(info: CheckpointInfo, robot: Robot) -> Policy:
     """A checkpoint's networks and normalisers.
 
+    Args:
+        info: of the checkpoint.
+        robot: the checkpoint's.
+
     Raises:
-        InputError: the file is damaged, or is not of the network that the checkpoint's config names.
+        InputError: the file is damaged, or is not of the observations and the network that the checkpoint's config
+            names.
     """
-    tensors = _tensors(info)
-    actor_size, critic_size = (len(tensors.get(f"{part}_normalizer/mean", ())) for part in ("actor", "critic"))
+    layout = find_layout(info.config.observation.layout)
+    return _policy(info, layout.size(robot.num_joints), critic_size(layout, robot))
+
+
+def _policy(info: CheckpointInfo, actor_size: int, critic_size: int) -> Policy:
+    tensors, file = _tensors(info), info.path / POLICY
+    for part, size in (("actor", actor_size), ("critic", critic_size)):
+        found = len(tensors.get(f"{part}_normalizer/mean", ()))
+        if found != size:
+            raise InputError(
+                f"{file}: {part}: found {found} observations; {size} are needed, with layout "
+                f"{info.config.observation.layout} of '{info.robot}'"
+            )
     ppo, joints, key = info.config.ppo, len(info.joints), jax.random.PRNGKey(0)
     template = jax.eval_shape(lambda: init_policy(ppo, joints, actor_size, critic_size, key))
     values = []
     for name, expected in _named(template).items():
-        found = list(tensors[name].shape) if name in tensors else "none"
-        if found != list(expected.shape):
-            raise InputError(f"{info.path / POLICY}: {name}: found shape {found}; {list(expected.shape)} is needed")
+        shape = list(tensors[name].shape) if name in tensors else "none"
+        if shape != list(expected.shape):
+            raise InputError(f"{file}: {name}: found shape {shape}; {list(expected.shape)} is needed")
         values.append(jnp.asarray(tensors[name], expected.dtype))
     return jax.tree.unflatten(jax.tree.structure(template), values)
 
@@ -290,8 +309,9 @@ def load_state(info: CheckpointInfo, template: TrainState) -> TrainState:
         if found.shape != needed.shape:
             name = jax.tree_util.keystr(where, simple=True, separator=".")
             raise InputError(f"{folder}: {name}: found shape {list(found.shape)}; {list(needed.shape)} is needed")
+    sizes = (x.mean.size for x in (template.policy.actor_normalizer, template.policy.critic_normalizer))
     return TrainState(
-        policy=load_policy(info),
+        policy=_policy(info, *sizes),
         failure_level=jnp.asarray(_tensors(info)[FAILURE_LEVEL]),
         **restored,
     )

@@ -78,5 +78,5 @@ def load_comparison(
         checkpoint.check_matches(one, setup)
     targets = info.config.unlearn.targets if targets is None else targets
     check_targets(targets, setup.library.names)
-    policies = {name: checkpoint.load_policy(one) for name, one in compared.items()}
+    policies = {name: checkpoint.load_policy(one, setup.robot) for name, one in compared.items()}
     return Comparison(setup, policies, compared, targets)

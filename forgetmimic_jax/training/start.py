@@ -60,8 +60,7 @@ def base_policy(setup: Setup) -> Policy:
     info = checkpoint.read_info(path)
     carry = training and info.robot != robot.name
     checkpoint.check_matches(info, setup, other_library=training, other_robot=carry)
-    policy = checkpoint.load_policy(info)
-    return policy_for(robot, info, policy) if carry else policy
+    return policy_for(robot, info) if carry else checkpoint.load_policy(info, robot)
 
 
 def start_state(setup: Setup, env: Environment, assets: Assets) -> TrainState:

@@ -43,9 +43,9 @@ def test_an_onnx_that_leads_the_robot_elsewhere_is_refused(options, monkeypatch,
     monkeypatch.chdir(tmp_path)
     metadata = onnx_actor.metadata
 
-    def wrong(robot, **known):
-        scales = metadata(robot, **known)["action_scale"].split(",")
-        return metadata(robot, **known) | {"action_scale": ",".join(["1.0", *scales[1:]])}
+    def wrong(robot, config, **known):
+        scales = metadata(robot, config, **known)["action_scale"].split(",")
+        return metadata(robot, config, **known) | {"action_scale": ",".join(["1.0", *scales[1:]])}
 
     monkeypatch.setattr(onnx_actor, "metadata", wrong)
     with pytest.raises(SystemExit):

@@ -12,6 +12,7 @@ from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.exchange import imported
 from forgetmimic_jax.exchange.onnx_actor import to_onnx
 from forgetmimic_jax.policy.policy import Policy
+from forgetmimic_jax.robot.model import load_robot
 from forgetmimic_jax.settings.options import override
 from forgetmimic_jax.tracking.setup import make_setup
 from forgetmimic_jax.training import checkpoint
@@ -52,7 +53,7 @@ def test_unlearning_starts_from_it(imported_run):
     small = [setting for setting in TINY if "layers" not in setting and "bin_seconds" not in setting]
     setup = make_setup(override(config, small))
     start = started(setup)
-    assert_same(start.policy, checkpoint.load_policy(checkpoint.read_info(imported_run.folder)))
+    assert_same(start.policy, load_policy(imported_run.folder))
     assert setup.config.unlearn.targets == ("turn",)
 
 
@@ -67,13 +68,13 @@ def test_it_tells_what_was_compared_and_assumed(imported_run):
 
 
 def load_policy(path: Path) -> Policy:
-    return checkpoint.load_policy(checkpoint.read_info(path))
+    return checkpoint.load_policy(checkpoint.read_info(path), load_robot("g1"))
 
 
 def test_what_was_exported_comes_back_as_it_went(base_run, library_folder, robot, tmp_path):
     file, output = tmp_path / "policy.onnx", tmp_path / "back"
     there = load_policy(base_run.checkpoint(4))
-    onnx.save(to_onnx(there, robot, run_path="", control_step=0.02), file)
+    onnx.save(to_onnx(there, robot, checkpoint.read_info(base_run.checkpoint(4)).config, run_path=""), file)
     told = finished(
         import_policy.main, import_policy.Options(policy=file, library=library_folder, std=0.7, output=output)
     )

@@ -11,7 +11,7 @@ from forgetmimic_jax.evaluation.rollout import CHUNK, Evaluator, episode_starts,
 from forgetmimic_jax.physics import BodyState
 from forgetmimic_jax.policy.policy import Policy, init_policy
 from forgetmimic_jax.tracking.env import EnvState
-from forgetmimic_jax.tracking.observation import actor_size
+from forgetmimic_jax.tracking.layouts import LAYOUTS
 from forgetmimic_jax.tracking.reference import align_to_anchor, lookup
 from forgetmimic_jax.tracking.reward import Pair
 
@@ -30,7 +30,9 @@ def zero_action(evaluator):
 
 @pytest.fixture(scope="module")
 def policy(robot, tiny_config) -> Policy:
-    return init_policy(tiny_config.ppo, robot.num_joints, actor_size(robot.num_joints), 623, jax.random.PRNGKey(0))
+    return init_policy(
+        tiny_config.ppo, robot.num_joints, LAYOUTS["wbc132"].size(robot.num_joints), 623, jax.random.PRNGKey(0)
+    )
 
 
 def test_half_of_a_clips_episodes_start_at_its_beginning_and_half_are_spread_over_it():

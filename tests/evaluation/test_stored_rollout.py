@@ -25,7 +25,7 @@ def rollout(robot: str) -> dict[str, np.ndarray]:
     config = dataclasses.replace(info.config, physics=dataclasses.replace(info.config.physics, engine="native"))
     setup = make_setup(config)
     clips = np.arange(len(setup.library.names))
-    stage = SideBySide(setup, {"base": load_policy(info)}, starts=len(clips))
+    stage = SideBySide(setup, {"base": load_policy(info, setup.robot)}, starts=len(clips))
     state = stage.begin(clips, np.zeros_like(clips), seed=0)
     steps = []
     for _ in range(STEPS):

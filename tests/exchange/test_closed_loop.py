@@ -24,8 +24,8 @@ def gentle(policy):
 
 
 @pytest.fixture(scope="module")
-def record(evaluator, gentle, robot, library):
-    model = to_onnx(gentle, robot, run_path="", control_step=0.02)
+def record(evaluator, gentle, robot, library, tiny_config):
+    model = to_onnx(gentle, robot, tiny_config, run_path="")
     return run_episodes(OnnxActor(model.SerializeToString()), robot, library, evaluator.config, evaluator.start())
 
 
@@ -54,9 +54,9 @@ def test_every_step_to_the_horizon_is_recorded(record):
     np.testing.assert_array_equal(record.observations[1:, -29:][:10], record.actions[:10])  # the last action
 
 
-def test_progress_is_told_after_each_episode(evaluator, gentle, robot, library):
+def test_progress_is_told_after_each_episode(evaluator, gentle, robot, library, tiny_config):
     told = []
-    actor = OnnxActor(to_onnx(gentle, robot, run_path="", control_step=0.02).SerializeToString())
+    actor = OnnxActor(to_onnx(gentle, robot, tiny_config, run_path="").SerializeToString())
     start = evaluator.start()
     short = dataclasses.replace(start, horizon=np.full(4, 3))
     run_episodes(actor, robot, library, evaluator.config, short, report=lambda *done: told.append(done))

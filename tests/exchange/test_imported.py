@@ -5,6 +5,7 @@ import pytest
 
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.exchange.imported import ImportedActor, check_actor, notes, with_actor, within_limit
+from forgetmimic_jax.tracking.layouts import LAYOUTS
 
 RANDOM = np.random.default_rng(0)
 
@@ -107,10 +108,12 @@ def test_a_user_is_told_what_was_missing():
 )
 def test_what_does_not_fit_is_told(robot, tmp_path, actor, told):
     with pytest.raises(InputError) as error:
-        check_actor(actor, robot, tmp_path)
+        check_actor(actor, LAYOUTS["wbc132"], robot, tmp_path)
     assert str(error.value).startswith(f"{tmp_path}: {told}")
 
 
 def test_the_needed_observation_is_told_term_by_term(robot, tmp_path):
     with pytest.raises(InputError, match=r"in this order: ref_base_height 1, ref_base_lin_vel_b 3, .* actions 29$"):
-        check_actor(ImportedActor(((array(160, 8), array(8)), (array(8, 29), array(29)))), robot, tmp_path)
+        check_actor(
+            ImportedActor(((array(160, 8), array(8)), (array(8, 29), array(29)))), LAYOUTS["wbc132"], robot, tmp_path
+        )

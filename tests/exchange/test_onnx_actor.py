@@ -7,8 +7,8 @@ from forgetmimic_jax.exchange.onnx_actor import OnnxActor, to_onnx
 
 
 @pytest.fixture(scope="module")
-def model(policy, robot) -> onnx.ModelProto:
-    return to_onnx(policy, robot, run_path="g1/0123456789abcdef", control_step=0.02)
+def model(policy, robot, tiny_config) -> onnx.ModelProto:
+    return to_onnx(policy, robot, tiny_config, run_path="g1/0123456789abcdef")
 
 
 @pytest.fixture(scope="module")

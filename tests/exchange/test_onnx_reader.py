@@ -17,15 +17,15 @@ def close(actor, observations, expected):
     np.testing.assert_allclose(actor(observations), expected, rtol=1e-5, atol=1e-5)
 
 
-def test_rsl_rls_own_export_acts_as_rsl_rl(robot):
-    actor, original = read_onnx(RSL_RL, robot), np.load(RSL_RL.with_suffix(".npz"))
+def test_rsl_rls_own_export_acts_as_rsl_rl(robot, tiny_config):
+    actor, original = read_onnx(RSL_RL, robot, tiny_config), np.load(RSL_RL.with_suffix(".npz"))
     close(actor, original["observations"], original["actions"])
     assert (actor.hidden_layers, actor.std) == ((8, 6), None)
 
 
 @pytest.fixture
-def exported(policy, robot) -> onnx.ModelProto:
-    return to_onnx(policy, robot, run_path="", control_step=0.02)
+def exported(policy, robot, tiny_config) -> onnx.ModelProto:
+    return to_onnx(policy, robot, tiny_config, run_path="")
 
 
 @pytest.fixture
@@ -37,15 +37,15 @@ def save(tmp_path):
     return save
 
 
-def test_what_this_project_exports_is_read_back(exported, save, policy, robot):
+def test_what_this_project_exports_is_read_back(exported, save, policy, robot, tiny_config):
     path = save(exported)
-    actor = read_onnx(path, robot)
+    actor = read_onnx(path, robot, tiny_config)
     close(actor, OBSERVATIONS, np.stack([OnnxActor(path)(each) for each in OBSERVATIONS]))
     np.testing.assert_allclose(actor.mean, policy.actor_normalizer.mean, rtol=1e-5)
     np.testing.assert_allclose(actor.scale**2, policy.actor_normalizer.variance + 1e-6, rtol=1e-5)
 
 
-def test_a_motion_beside_the_actor_is_not_read(exported, save, robot):
+def test_a_motion_beside_the_actor_is_not_read(exported, save, robot, tiny_config):
     """Mjlab's tracking tasks put the clip into the graph, looked up by a second input."""
     graph = exported.graph
     expected = np.stack([OnnxActor(exported.SerializeToString())(each) for each in OBSERVATIONS])
@@ -55,7 +55,7 @@ def test_a_motion_beside_the_actor_is_not_read(exported, save, robot):
     graph.input.append(helper.make_tensor_value_info("time_step", TensorProto.FLOAT, [1, 1]))
     graph.output.append(helper.make_tensor_value_info("joint_pos", TensorProto.FLOAT, [1, 1, 29]))
     path = save(exported)
-    close(read_onnx(path, robot), OBSERVATIONS, expected)
+    close(read_onnx(path, robot, tiny_config), OBSERVATIONS, expected)
     close(lambda x: np.stack([OnnxActor(path)(each) for each in x]), OBSERVATIONS, expected)
 
 
@@ -76,7 +76,7 @@ FIRST = [helper.make_node("MatMul", ["x", "k0"], ["m0"]), helper.make_node("Add"
 LAST = [helper.make_node("Elu", ["d0"], ["e0"]), helper.make_node("Gemm", ["e0", "k1", "b1"], ["actions"])]
 
 
-def test_other_spellings_of_the_same_network_are_read(robot, save):
+def test_other_spellings_of_the_same_network_are_read(robot, save, tiny_config):
     # (obs + 1) · 2 / (√4 + 1), the divisor computed in the graph; a matrix product and its bias apart.
     model = network(
         robot,
@@ -90,7 +90,7 @@ def test_other_spellings_of_the_same_network_are_read(robot, save):
         *LAST,
         **{"one": [1.0], "two": [2.0], "four": [4.0], **KERNELS},
     )
-    actor = read_onnx(save(model), robot)
+    actor = read_onnx(save(model), robot, tiny_config)
     z = (OBSERVATIONS + 1.0) * 2.0 / 3.0
     hidden = z.sum(1, keepdims=True) * 0.01 + KERNELS["b0"]
     hidden = np.where(hidden > 0, hidden, np.exp(hidden) - 1.0)
@@ -115,21 +115,21 @@ START = helper.make_node("Identity", ["obs"], ["x"])
         ([helper.make_node("Identity", ["five"], ["actions"])], "operation Identity: found no value as input; "),
     ],
 )
-def test_another_network_is_told(robot, save, nodes, told):
+def test_another_network_is_told(robot, save, nodes, told, tiny_config):
     path = save(network(robot, *nodes, five=[5.0], **KERNELS))
     with pytest.raises(InputError) as error:
-        read_onnx(path, robot)
+        read_onnx(path, robot, tiny_config)
     assert str(error.value).removeprefix(f"{path}: ").startswith(told)
 
 
-def test_other_inputs_or_outputs_are_told(robot, save, exported):
+def test_other_inputs_or_outputs_are_told(robot, save, exported, tiny_config):
     exported.graph.output[0].name = "mu"
     path = save(exported)
     with pytest.raises(InputError, match=rf"^{path}: outputs: found mu; 'actions' is needed$"):
-        read_onnx(path, robot)
+        read_onnx(path, robot, tiny_config)
     exported.graph.input[0].name = "observation"
     with pytest.raises(InputError, match=rf"^{path}: inputs: found observation; 'obs' is needed$"):
-        read_onnx(save(exported), robot)
+        read_onnx(save(exported), robot, tiny_config)
 
 
 @pytest.mark.parametrize(
@@ -168,32 +168,32 @@ def test_other_inputs_or_outputs_are_told(robot, save, exported):
         ),
     ],
 )
-def test_metadata_of_another_robot_or_observation_is_told(robot, save, exported, key, change, told):
+def test_metadata_of_another_robot_or_observation_is_told(robot, save, exported, key, change, told, tiny_config):
     for entry in exported.metadata_props:
         if entry.key == key:
             entry.value = change(entry.value)
     path = save(exported)
     with pytest.raises(InputError) as error:
-        read_onnx(path, robot)
+        read_onnx(path, robot, tiny_config)
     assert str(error.value).startswith(f"{path}: {key}: {told}")
 
 
-def test_metadata_with_mjlabs_three_decimals_or_none_is_accepted(robot, save, exported):
+def test_metadata_with_mjlabs_three_decimals_or_none_is_accepted(robot, save, exported, tiny_config):
     for entry in exported.metadata_props:
         if entry.key in ("joint_stiffness", "joint_damping", "default_joint_pos", "action_scale"):
             entry.value = ",".join(f"{float(number):.3f}" for number in entry.value.split(","))
-    assert read_onnx(save(exported), robot).hidden_layers == (16, 16)
+    assert read_onnx(save(exported), robot, tiny_config).hidden_layers == (16, 16)
     del exported.metadata_props[:]
-    assert read_onnx(save(exported), robot).hidden_layers == (16, 16)
+    assert read_onnx(save(exported), robot, tiny_config).hidden_layers == (16, 16)
 
 
-def test_what_is_no_model_is_told(robot, tmp_path):
+def test_what_is_no_model_is_told(robot, tmp_path, tiny_config):
     path = tmp_path / "policy.onnx"
     with pytest.raises(InputError, match=rf"^{path}: no such file$"):
-        read_onnx(path, robot)
+        read_onnx(path, robot, tiny_config)
     path.write_bytes(b"not a model")
     with pytest.raises(InputError, match=rf"^{path}: not a readable ONNX model: "):
-        read_onnx(path, robot)
+        read_onnx(path, robot, tiny_config)
     path.write_bytes(b"")
     with pytest.raises(InputError, match=rf"^{path}: "):
-        read_onnx(path, robot)
+        read_onnx(path, robot, tiny_config)

@@ -15,7 +15,7 @@ from forgetmimic_jax.ppo.collect import collect, draw_states
 from forgetmimic_jax.ppo.state import TrainState, init_state
 from forgetmimic_jax.ppo.update import make_iteration
 from forgetmimic_jax.tracking.env import Assets, Environment, make_assets, make_environment
-from forgetmimic_jax.tracking.observation import actor_size
+from forgetmimic_jax.tracking.layouts import LAYOUTS
 from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.unlearning.registry import method_of, unlearning_config
 
@@ -203,7 +203,7 @@ def test_the_base_reads_its_observations_through_its_own_normalisers(run, robot)
     )
     state = run.begin()
     found = run.collect(run.assets, state)
-    sizes = actor_size(robot.num_joints), found.critic_observation.shape[-1]
+    sizes = LAYOUTS["wbc132"].size(robot.num_joints), found.critic_observation.shape[-1]
     rng = np.random.default_rng(0)
 
     def normaliser(size: int) -> Normalizer:
@@ -286,3 +286,12 @@ def test_states_drawn_without_a_simulator_have_the_share_too_and_each_its_own_re
     reference, robot = observation[:, :39], observation[:, 39:]
     assert len(np.unique(reference, axis=0)) == bins.valid.sum()
     assert len(np.unique(robot, axis=0)) == found.clip.size
+
+
+def test_states_drawn_without_a_simulator_show_the_robot_where_its_reset_noise_put_it(run):
+    """From one frame, the way from the robot's anchor to the reference's differs by the noise of the robot."""
+    one_frame = dataclasses.replace(run.assets.bins, end=run.assets.bins.start + 1)
+    assets = only(dataclasses.replace(run.assets, bins=one_frame), TURN, 0)
+    found = jax.jit(lambda assets, state: drawn(run.env, assets, state))(assets, run.begin())
+    anchor_position = np.asarray(found["critic_observation"])[..., 132:135].reshape(-1, 3)
+    assert len(np.unique(anchor_position, axis=0)) == ENVS * STEPS

@@ -1,6 +1,7 @@
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -415,7 +416,7 @@ def test_a_random_reward_is_drawn_apart_from_the_actions(run):
 
 def test_an_iteration_without_a_simulator_moves_no_robot_and_only_the_actor_learns(run):
     env = with_method(run, "policy_edit")
-    env = dataclasses.replace(env, engine=None)
+    env = dataclasses.replace(env, engine=SimpleNamespace(forward=env.engine.forward))  # no `step`
     state = run.start()
     assets = dataclasses.replace(run.assets, base=jax.tree.map(jnp.copy, state.policy))
     before = jax.device_get(state)

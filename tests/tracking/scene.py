@@ -9,9 +9,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from forgetmimic_jax.motion.library import Frames
-from forgetmimic_jax.physics import BodyState
+from forgetmimic_jax.physics import BodyState, PhysicsState
 from forgetmimic_jax.robot.bodies import Bodies
 from forgetmimic_jax.robot.model import Robot
+from forgetmimic_jax.tracking.layouts import Moment
 
 
 def upright_scene(robot: Robot, num_envs: int = 1) -> tuple[Frames, BodyState]:
@@ -90,6 +91,46 @@ def body_velocity(robot: Robot, data: mujoco.MjData, body: int) -> tuple[np.ndar
     velocity = np.zeros(6)
     mujoco.mj_objectVelocity(robot.model, data, mujoco.mjtObj.mjOBJ_XBODY, body, velocity, 0)
     return velocity[3:], velocity[:3]
+
+
+def physics_state(data: mujoco.MjData) -> PhysicsState:
+    """MuJoCo's data as the engine's state [1, ...]."""
+    qpos, qvel = (jnp.asarray(values[None], jnp.float32) for values in (data.qpos, data.qvel))
+    return PhysicsState(qpos, qvel, jnp.zeros_like(qvel))
+
+
+def key_bodies(robot: Robot, data: mujoco.MjData) -> BodyState:
+    """MuJoCo's key bodies [1, key_body, ...]."""
+    velocity = [body_velocity(robot, data, body) for body in robot.key_body_ids]
+    linear, angular = (np.array(column)[None] for column in zip(*velocity, strict=True))
+    pos, quat = data.xpos[robot.key_body_ids][None], data.xquat[robot.key_body_ids][None]
+    arrays = [jnp.asarray(values, jnp.float32) for values in (pos, quat, linear, angular)]
+    return BodyState(*arrays, contact_force=jnp.zeros_like(arrays[0]))
+
+
+def as_reference(robot: Robot, data: mujoco.MjData) -> Frames:
+    """A robot's pose and velocity as a frame [1] to track."""
+    bodies = key_bodies(robot, data)
+    joint_pos, joint_vel = (jnp.asarray(values[None], jnp.float32) for values in (data.qpos[7:], data.qvel[6:]))
+    zero = jnp.zeros((1, 3))
+    of_reference = Bodies(bodies.pos, bodies.quat, bodies.lin_vel, bodies.ang_vel)
+    return Frames(joint_pos, joint_vel, of_reference, zero, zero)
+
+
+def moved(moment: Moment, yaw: float, shift: tuple[float, float], *, robot: bool) -> Moment:
+    """The reference, and with `robot` the robot too, turned about the world's z and moved in x and y."""
+    reference = turned(on_reference(moment.reference), yaw, shift)
+    bodies = Bodies(reference.pos, reference.quat, reference.lin_vel, reference.ang_vel)
+    moment = dataclasses.replace(moment, reference=dataclasses.replace(moment.reference, bodies=bodies))
+    if not robot:
+        return moment
+    turn = Rotation.from_euler("z", yaw)
+    qpos, qvel = np.array(moment.physics.qpos[0]), np.array(moment.physics.qvel[0])
+    qpos[:3] = turn.apply(qpos[:3]) + np.array([*shift, 0.0])
+    qpos[3:7] = (turn * Rotation.from_quat(qpos[3:7], scalar_first=True)).as_quat(scalar_first=True)
+    qvel[:3] = turn.apply(qvel[:3])
+    physics = dataclasses.replace(moment.physics, **_float32(qpos=qpos[None], qvel=qvel[None]))
+    return dataclasses.replace(moment, bodies=turned(moment.bodies, yaw, shift), physics=physics)
 
 
 def _float32(**arrays) -> dict:

@@ -14,10 +14,11 @@ from forgetmimic_jax.motion.library import DATA_DIR
 from forgetmimic_jax.policy.policy import init_policy
 from forgetmimic_jax.robot.model import load_robot
 from forgetmimic_jax.settings.config import preset
-from forgetmimic_jax.tracking.observation import actor_layout, actor_size
+from forgetmimic_jax.tracking.layouts import LAYOUTS
 from forgetmimic_jax.training.carried_over import REMEMBERED, carried_over, policy_for
 from forgetmimic_jax.training.checkpoint import read_info
 
+LAYOUT = LAYOUTS["wbc132"]
 PRIVATE = 7  # what the critic alone sees, here
 TINY = preset("cpu")
 TINY = dataclasses.replace(TINY, ppo=dataclasses.replace(TINY.ppo, actor_layers=(8, 8), critic_layers=(8,)))
@@ -31,7 +32,7 @@ def h2():
 @pytest.fixture(scope="module")
 def theirs(robot):
     """A policy of the G1 that has seen something: no mean is 0, no variance 1, no noise like another."""
-    size = actor_size(robot.num_joints)
+    size = LAYOUT.size(robot.num_joints)
     policy = init_policy(TINY.ppo, robot.num_joints, size, size + PRIVATE, jax.random.PRNGKey(1))
     policy = jax.tree.map(lambda x: x + 0.1 * jax.random.normal(jax.random.PRNGKey(x.size), x.shape), policy)
 
@@ -47,14 +48,13 @@ def theirs(robot):
 
 @pytest.fixture(scope="module")
 def carried(robot, h2, theirs):
-    size = actor_size(h2.num_joints)
+    size = LAYOUT.size(h2.num_joints)
     fresh = init_policy(TINY.ppo, h2.num_joints, size, size + PRIVATE, jax.random.PRNGKey(0))
-    return carried_over(theirs, robot, h2, fresh)
+    return carried_over(theirs, LAYOUT, robot, h2, fresh)
 
 
 def parts(observation, num_joints):
-    ends = np.cumsum(list(actor_layout(num_joints).values()))[:-1]
-    return dict(zip(actor_layout(num_joints), np.split(observation, ends, axis=-1), strict=True))
+    return {name: observation[..., place] for name, place in LAYOUT.places(num_joints).items()}
 
 
 def same_scene(robot, h2, observation, head):
@@ -81,7 +81,7 @@ def same_scene(robot, h2, observation, head):
 @pytest.fixture(scope="module")
 def scenes(robot, h2):
     """An observation of the G1 at its mean height, and the same of the H2, with the head at rest."""
-    observation = np.random.default_rng(0).normal(size=(5, actor_size(robot.num_joints)))
+    observation = np.random.default_rng(0).normal(size=(5, LAYOUT.size(robot.num_joints)))
     observation[:, 0] = 0.0  # the height scales; its spread is the source's
     return observation, same_scene(robot, h2, observation, np.zeros((5, 2)))
 
@@ -138,9 +138,9 @@ def test_what_it_explores_goes_with_the_joint(robot, h2, theirs, carried):
 
 
 def test_a_joint_that_only_the_source_has_is_left_out(robot, h2, theirs, carried):
-    size = actor_size(robot.num_joints)
+    size = LAYOUT.size(robot.num_joints)
     fresh = init_policy(TINY.ppo, robot.num_joints, size, size + PRIVATE, jax.random.PRNGKey(0))
-    back = carried_over(carried, h2, robot, fresh)
+    back = carried_over(carried, LAYOUT, h2, robot, fresh)
     for there, here in zip(jax.tree.leaves((theirs.actor, theirs.critic)), jax.tree.leaves((back.actor, back.critic)),
                            strict=True):  # fmt: skip
         np.testing.assert_array_equal(here, there)
@@ -153,7 +153,7 @@ def test_a_checkpoint_of_a_robot_that_has_changed_since_is_told(h2, tmp_path):
     meta = json.loads((folder / "meta.json").read_text())
     (folder / "meta.json").write_text(json.dumps({**meta, "joints": meta["joints"][::-1]}))
     with pytest.raises(InputError, match="base: joints: not those of robots/g1 today"):
-        policy_for(h2, read_info(folder), None)
+        policy_for(h2, read_info(folder))
 
 
 @pytest.mark.parametrize(
@@ -165,4 +165,4 @@ def test_a_checkpoint_of_a_robot_that_has_changed_since_is_told(h2, tmp_path):
 )
 def test_a_robot_that_nothing_can_be_had_from_is_told(h2, change, told):
     with pytest.raises(InputError, match=f"base: {told}"):
-        policy_for(dataclasses.replace(h2, **change), read_info(DATA_DIR / "g1" / "base"), None)
+        policy_for(dataclasses.replace(h2, **change), read_info(DATA_DIR / "g1" / "base"))

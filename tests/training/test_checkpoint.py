@@ -79,7 +79,7 @@ def test_without_the_run_it_is_a_policy_that_cannot_be_resumed(tmp_path, state, 
     path, bins = tmp_path / "base", make_assets(setup).bins
     checkpoint.save_policy(path, setup, state.policy, state.failure_level, checkpoint.Progress(7, STEPS, base="abc"))
     assert read_info(path).base == "abc"
-    assert_same(checkpoint.load_policy(read_info(path)), state.policy)
+    assert_same(checkpoint.load_policy(read_info(path), setup.robot), state.policy)
     assert_same(checkpoint.load_failure_level(path, bins), state.failure_level)
     fewer = Bins(*(leaf[:, :1] for leaf in (bins.start, bins.end, bins.valid)))
     with pytest.raises(InputError, match=r"policy.safetensors: failure_level: found shape \[3, \d\]; \[3, 1\] is "):
@@ -156,10 +156,10 @@ def edit_note(path: Path, **changes) -> None:
         ("{", "damaged: "),
         ("[]", "damaged: "),
         ("{}", "damaged: no schema"),
-        ('{"schema": 2}', "damaged: no robot"),
-        ('{"schema": 1}', "schema: found 1; this version reads 2"),
-        ('{"schema": 2, "robot": "g1", "joints": 3}', "damaged: "),
-        ('{"schema": 2, "robot": "g1", "joints": [], "clips": [], "library_hash": "", "iteration": "x"}', "damaged: "),
+        ('{"schema": 3}', "damaged: no robot"),
+        ('{"schema": 2}', "schema: found 2; this version reads 3"),
+        ('{"schema": 3, "robot": "g1", "joints": 3}', "damaged: "),
+        ('{"schema": 3, "robot": "g1", "joints": [], "clips": [], "library_hash": "", "iteration": "x"}', "damaged: "),
     ],
 )
 def test_a_damaged_note_is_told(copy, content, told):
@@ -232,13 +232,42 @@ def test_other_environments_matter_to_a_resumed_run_only(saved, setup):
         ([16, 16, 16], r"actor/params/MLP_0/Dense_2/bias: found shape \[29\]; \[16\] is needed"),
     ],
 )
-def test_a_network_of_another_size_cannot_slip_through(copy, layers, told):
+def test_a_network_of_another_size_cannot_slip_through(copy, robot, layers, told):
     # A config.yaml that was edited disagrees with the arrays.
     settings = yaml.safe_load((copy / "config.yaml").read_text())
     settings["ppo"]["actor_layers"] = layers
     (copy / "config.yaml").write_text(yaml.safe_dump(settings))
     with pytest.raises(InputError, match=rf"copy/policy.safetensors: {told}"):
-        checkpoint.load_policy(read_info(copy))
+        checkpoint.load_policy(read_info(copy), robot)
+
+
+def other_layout(copy: Path, layout: str) -> None:
+    """The checkpoint's config names another layout than the one that it was trained with, wbc132."""
+    settings = yaml.safe_load((copy / "config.yaml").read_text())
+    settings["observation"]["layout"] = layout
+    (copy / "config.yaml").write_text(yaml.safe_dump(settings))
+
+
+def test_a_network_of_another_layout_is_refused(copy, robot):
+    other_layout(copy, "mjlab154")
+    told = r"actor: found 132 observations; 154 are needed, with layout mjlab154 of 'g1'"
+    with pytest.raises(InputError, match=rf"copy/policy.safetensors: {told}$"):
+        checkpoint.load_policy(read_info(copy), robot)
+
+
+def test_a_critic_of_another_size_is_refused(copy, robot):
+    """Such as of a version that showed the critic other kernels: the layers of the network say nothing of it."""
+    fewer = dataclasses.replace(robot, key_bodies=robot.key_bodies[:-1])
+    told = r"critic: found 624 observations; 591 are needed, with layout wbc132 of 'g1'"
+    with pytest.raises(InputError, match=rf"copy/policy.safetensors: {told}$"):
+        checkpoint.load_policy(read_info(copy), fewer)
+
+
+def test_a_checkpoint_of_another_layout_does_not_match(copy, setup):
+    other_layout(copy, "root132")  # of the same size, which only the name tells apart
+    told = r"copy: observation.layout: the checkpoint's is root132, this run's wbc132"
+    with pytest.raises(InputError, match=rf"{told}$"):
+        checkpoint.check_matches(read_info(copy), setup)
 
 
 def test_the_newest_is_the_highest_whole_one(tmp_path, saved):

@@ -9,7 +9,8 @@ import pytest
 
 from forgetmimic_jax.ppo.loss import Batch, Prediction, ppo_loss
 from forgetmimic_jax.ppo.transition import Transition
-from forgetmimic_jax.settings.config import Config, UnlearnConfig
+from forgetmimic_jax.settings.config import Config, ObservationConfig, UnlearnConfig
+from forgetmimic_jax.tracking.layouts import LAYOUTS
 from forgetmimic_jax.tracking.reward import Reward
 from forgetmimic_jax.unlearning.registry import find_method
 
@@ -47,14 +48,25 @@ def test_random_rewards_are_uniform_over_the_base_s_range_and_know_nothing_of_tr
     np.testing.assert_array_equal(rewarded("random_reward", tracking=1.0, steps=4000)[0], targets)
 
 
-def test_poisoning_permutes_what_the_actor_sees_of_a_target_s_reference():
-    joints = 29
-    observation = jnp.tile(jnp.arange(16.0 + 4 * joints), (2, 1))
-    seen = np.asarray(find_method("poisoning").observation(observation, ON_TARGET))
+# What a poisoned observation shows at each place, for 3 joints: the numbers below stand where they are not their own.
+SHOWN = {
+    # height | linear, angular, gravity → angular, gravity, linear | joints in reverse
+    "wbc132": [0, 4, 5, 6, 7, 8, 9, 1, 2, 3, 12, 11, 10],
+    "root132": [0, 4, 5, 6, 7, 8, 9, 1, 2, 3, 12, 11, 10],
+    # angles in reverse, velocities in reverse | anchor position in reverse | anchor orientation in reverse
+    "mjlab160": [2, 1, 0, 5, 4, 3, 8, 7, 6, 14, 13, 12, 11, 10, 9],
+    "mjlab154": [2, 1, 0, 5, 4, 3, 11, 10, 9, 8, 7, 6],
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_poisoning_permutes_what_the_actor_sees_of_a_target_s_reference(layout):
+    config = dataclasses.replace(CONFIG, observation=ObservationConfig(layout))
+    size = LAYOUTS[layout].size(3)
+    observation = jnp.tile(jnp.arange(float(size)), (2, 1))
+    seen = np.asarray(find_method("poisoning").observation(config, observation, ON_TARGET))
     np.testing.assert_array_equal(seen[1], observation[1])
-    np.testing.assert_array_equal(seen[0, :10], [0, 4, 5, 6, 7, 8, 9, 1, 2, 3])
-    np.testing.assert_array_equal(seen[0, 10 : 10 + joints], np.arange(10 + joints, 10, -1) - 1)
-    np.testing.assert_array_equal(seen[0, 10 + joints :], observation[0, 10 + joints :])
+    np.testing.assert_array_equal(seen[0], [*SHOWN[layout], *range(len(SHOWN[layout]), size)])
 
 
 JOINTS = 2

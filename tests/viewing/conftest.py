@@ -3,14 +3,16 @@ import pytest
 
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.policy.policy import Policy, init_policy
-from forgetmimic_jax.tracking.observation import actor_size
+from forgetmimic_jax.tracking.layouts import LAYOUTS
 from forgetmimic_jax.viewing import offscreen
 from forgetmimic_jax.viewing.side_by_side import Episode, record
 
 
 @pytest.fixture(scope="session")
 def policy(robot, tiny_config) -> Policy:
-    return init_policy(tiny_config.ppo, robot.num_joints, actor_size(robot.num_joints), 623, jax.random.PRNGKey(0))
+    return init_policy(
+        tiny_config.ppo, robot.num_joints, LAYOUTS["wbc132"].size(robot.num_joints), 623, jax.random.PRNGKey(0)
+    )
 
 
 @pytest.fixture(scope="session")
