@@ -1,9 +1,9 @@
 """Membership inference: does a policy's behaviour show that it was trained on a clip?
 
-Tier 1: a clip against its mirror image, which is as hard and was never trained on. The attacker knows the kept clips and
-their mirror images, learns from both what a trained clip looks like, and then classifies the targets and theirs. The
-features are the paper's: tracking reward, success and episode length. What the attack finds is evidence; what it does
-not find may still be there.
+Tier 1: a clip against its mirror image, which is as hard and was never trained on. The attacker learns from the kept
+clips and their mirror images what a trained clip looks like, and then classifies the targets and their mirror images.
+The features are the paper's: tracking reward, success and episode length. What the attack finds is evidence; what it
+does not find may still be there.
 """
 
 from __future__ import annotations
