@@ -71,7 +71,8 @@ def findings(document: Document) -> Iterator[Finding]:
     """Wear: what the kept clips lose of their tracking at the start."""
     groups = document["results"]["groups"]
     start, end = groups[0]["kept"][TRACKING], groups[-1]["kept"][TRACKING]
-    evidence = f"kept tracking {number(start, 2)} at the start and {number(end, 2)} at the end; bound {share(BOUND)} of the start"
+    evidence = f"kept tracking {number(start, 2)} at the start, {number(end, 2)} at the end"
+    evidence += f"; bound {share(BOUND)} of the start"
     claim = f"the kept clips are not worn down after {document['asked']['iterations']:,} iterations"
     yield finding(claim, end, BOUND * start["mean"], evidence, below=False, main=True)
 

@@ -34,7 +34,7 @@ class Study:
         findings: (document) → what the numbers say of the paper's claims; the main ones answer `claim`.
         iterations: of each trial, by preset.
         asked: (lab) → what the results depend on beside the options, such as the values of a sweep.
-        answer: (document) → what was measured of `claim`, in one sentence; the evidence of the main findings by default.
+        answer: (document) → what was measured of `claim`, in one sentence; by default the main findings' evidence.
         watches: whether it reads the evaluations during training, which have `watched_episodes`.
     """
 
