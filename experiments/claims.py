@@ -57,7 +57,8 @@ def table(folder: Path = RESULTS, studies: Mapping[str, Study] = STUDIES) -> str
             continue
         found = answer(study.claim, corrected(study.findings(document)))
         link = f"[{study.name}](results/{name}.md)"
-        rows.append([found.claim, f"**{found.word}**", study.answer(document), str(found.seeds), link])
+        measured = study.answer(document) if study.answer else f"{found.evidence[:1].upper()}{found.evidence[1:]}."
+        rows.append([found.claim, f"**{found.word}**", measured, str(found.seeds), link])
     text = markdown_table(["the paper's claim", "here", "what was measured", "seeds", "study"], rows) if rows else ""
     return f"{text}\nNot measured yet: {', '.join(missing)}.\n" if missing else text
 

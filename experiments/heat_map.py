@@ -12,6 +12,7 @@ from forgetmimic_jax.evaluation.plots import curve, heat_map, new_figure
 from forgetmimic_jax.evaluation.tables import markdown_table, number
 from forgetmimic_jax.studies.claim import Finding, finding
 from forgetmimic_jax.studies.conduct import main
+from forgetmimic_jax.studies.findings import share
 from forgetmimic_jax.studies.lab import Lab
 from forgetmimic_jax.studies.study import Document, Study
 from forgetmimic_jax.studies.variants import TRACKING, over_seeds, within
@@ -70,18 +71,10 @@ def findings(document: Document) -> Iterator[Finding]:
     """Wear: what the kept clips lose of their tracking at the start."""
     groups = document["results"]["groups"]
     start, end = groups[0]["kept"][TRACKING], groups[-1]["kept"][TRACKING]
-    evidence = (
-        f"kept tracking {number(start, 2)} at the start and {number(end, 2)} at the end; bound {BOUND:.0%} of the start"
-    )
+    evidence = f"kept tracking {number(start, 2)} at the start, {number(end, 2)} at the end"
+    evidence += f"; bound {share(BOUND)} of the start"
     claim = f"the kept clips are not worn down after {document['asked']['iterations']:,} iterations"
     yield finding(claim, end, BOUND * start["mean"], evidence, below=False, main=True)
-
-
-def answer(document: Document) -> str:
-    """The kept clips at the start and at the end, in one sentence."""
-    start, end = (document["results"]["groups"][place]["kept"][TRACKING] for place in (0, -1))
-    length = f"{document['asked']['iterations']:,} iterations"
-    return f"Tracking of the kept clips is {number(start, 2)} at the start and {number(end, 2)} after {length}."
 
 
 def draw(document: Document) -> Figure:
@@ -118,7 +111,6 @@ STUDY = Study(
     body=body,
     draw=draw,
     findings=findings,
-    answer=answer,
 )
 
 if __name__ == "__main__":

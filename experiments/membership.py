@@ -57,8 +57,8 @@ def measure(lab: Lab) -> dict[str, Any]:
     attacks: dict[str, list[dict[str, float]]] = {}
     for key, rollout in members.items():
         both = features(rollout, twins[key])
-        known, asked = (tuple(values[mask] for values in both) for mask in (~is_target, is_target))
-        attacks.setdefault(key[0], []).append(dataclasses.asdict(attack(known, asked)))  # type: ignore[arg-type]
+        known, unknown = (tuple(values[mask] for values in both) for mask in (~is_target, is_target))
+        attacks.setdefault(key[0], []).append(dataclasses.asdict(attack(known, unknown)))  # type: ignore[arg-type]
     return {"policies": {label: over_seeds(found) for label, found in attacks.items()}}
 
 

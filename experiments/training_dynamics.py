@@ -84,25 +84,15 @@ def findings(document: Document) -> Iterator[Finding]:
         if label in configurations:
             rows = configurations[label]["rows"]
             first, last = rows[0][name], rows[-1][name]
-            evidence = (
-                f"{name.replace('_', ' ')} of {label.partition(':')[0]} {number(last, 3)} after {first['mean']:.3f}"
-            )
-            claim = f"{label}: {name.replace('_', ' ')} {'rises' if rises else 'falls'}"
+            words = name.replace("_", " ")
+            evidence = f"{words} {first['mean']:.3f} at the start, {number(last, 3)} at the end ({label})"
+            claim = f"{label}: {words} {'rises' if rises else 'falls'}"
             yield finding(claim, difference(last, first), 0.0, evidence, below=not rises, main=is_main)
     if B in configurations:
         first, last = (configurations[B]["rows"][place]["target/R_anti"] for place in (0, -1))
         bound = FORGOTTEN * first["mean"]
         evidence = f"R_anti a target step {number(last, 2)}; bound {bound:.2f}, a fifth of the first"
         yield finding(f"{B}: the targets' anti-reward goes to nothing", last, bound, evidence, below=False)
-
-
-def answer(document: Document) -> str:
-    """Entropy at the start and at the end, in one sentence."""
-    parts = []
-    for label, of in document["results"]["configurations"].items():
-        first, last = (of["rows"][place]["entropy"] for place in (0, -1))
-        parts.append(f"from {first['mean']:.2f} to {number(last, 2)} ({label.partition(':')[2].strip()})")
-    return f"Entropy goes {'; '.join(parts)}."
 
 
 def difference(last: Estimate, first: Estimate) -> Estimate:
@@ -141,7 +131,6 @@ STUDY = Study(
     body=body,
     draw=draw,
     findings=findings,
-    answer=answer,
 )
 
 if __name__ == "__main__":

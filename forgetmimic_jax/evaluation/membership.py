@@ -1,9 +1,9 @@
-"""Membership inference: can one tell from what a policy does that it was trained on a clip?
+"""Membership inference: does a policy's behaviour show that it was trained on a clip?
 
-Tier 1: a clip against its mirror image, which is as hard and was never trained on. The attacker knows which clips were
-kept, learns from them and from their images what having been trained on looks like, and is asked about the targets.
-The features are the paper's: tracking reward, success and episode length. It is a probe: what it finds is evidence,
-what it does not find may still be there.
+Tier 1: a clip against its mirror image, which is as hard and was never trained on. The attacker learns from the kept
+clips and their mirror images what a trained clip looks like, and then classifies the targets and their mirror images.
+The features are the paper's: tracking reward, success and episode length. What the attack finds is evidence; what it
+does not find may still be there.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ FALSE_POSITIVES = 0.05
 
 @dataclass(frozen=True)
 class Attack:
-    """How well members are told from their never-trained twins; guessing is 0.5, 0.5 and, of many others, 0.05."""
+    """How well members are separated from their mirror images; guessing has 0.5, 0.5 and, with many images, 0.05."""
 
     accuracy: float
     auc: float
@@ -54,10 +54,10 @@ def discriminant(members: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, f
     return direction, float(direction @ (members.mean(0) + others.mean(0)) / 2.0)
 
 
-def attack(known: tuple[np.ndarray, np.ndarray], asked: tuple[np.ndarray, np.ndarray]) -> Attack:
-    """Learn from `known` (members, others), each f[E, feature], and tell the `asked` apart."""
+def attack(known: tuple[np.ndarray, np.ndarray], unknown: tuple[np.ndarray, np.ndarray]) -> Attack:
+    """Learn from `known` (members, others), each f[E, feature], and classify the `unknown`."""
     direction, threshold = discriminant(*known)
-    members, others = (values @ direction for values in asked)
+    members, others = (values @ direction for values in unknown)
     accuracy = 0.5 * ((members > threshold).mean() + (others <= threshold).mean())
     strict = np.sort(others)[-1 - int(FALSE_POSITIVES * len(others))]
     return Attack(float(accuracy), auc(members, others), float((members > strict).mean()))

@@ -42,7 +42,7 @@ def comparable_settings(config: Config) -> dict[str, Any]:
 
 
 class Lasted(NamedTuple):
-    """How long a run took until a level, or until its end where it never got there."""
+    """How long a run took to a level, or to its end where it never reached the level."""
 
     iterations: float
     target_steps: float
@@ -59,9 +59,9 @@ def crossing(curve: Mapping[str, list[float]], level: float) -> tuple[float, flo
 
 
 def lasted(results: Mapping[str, Any], start: str, share: float) -> dict[str, Lasted]:
-    """By seed: until a start was back at a share of the base's tracking on the same episodes.
+    """By seed: how long until a start reached a share of the base's tracking on the same episodes.
 
-    A run that never was counts with its end, which is too early.
+    A run that never reached it counts with its end, and needs longer than that.
 
     Args:
         results: of the study's JSON.
@@ -77,9 +77,9 @@ def lasted(results: Mapping[str, Any], start: str, share: float) -> dict[str, La
 
 
 def at_first(results: Mapping[str, Any], start: str) -> dict[str, float]:
-    """By seed: of the base's tracking on the targets, what a start has before it relearns.
+    """By seed: tracking of a start on the targets before it relearns, as a share of the base's.
 
-    Without the seeds whose start was not evaluated, as those of a fresh policy.
+    Seeds whose start was not evaluated are absent, as those of a fresh policy.
     """
     curves = results["starts"][start]
     before = {seed: curve["tracking"][0] for seed, curve in curves.items() if curve["iterations"][0] == 0}

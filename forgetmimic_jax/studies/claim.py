@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
 
 from forgetmimic_jax.evaluation import statistics
 from forgetmimic_jax.evaluation.statistics import Estimate
@@ -72,6 +71,8 @@ def p_value(value: Estimate, bound: float) -> float | None:
 
     An interval excludes the bound where this is under 0.05.
     """
+    from scipy import stats  # which takes a second to load
+
     if "low" not in value:
         return None
     if "episodes" in value:  # an exact interval of all episodes together, see `variants.over_seeds`

@@ -46,7 +46,6 @@ def penalty_study(penalties: tuple[str, ...] = PENALTIES, name: str = "penalty")
         body=body,
         draw=draw,
         findings=findings,
-        answer=lambda document: _answer(document["results"]["variants"]),
     )
 
 
@@ -92,11 +91,6 @@ def findings(document: Document) -> Iterator[Finding]:
         evidence += f"; λ_crit on the base's steps {number(crit, 2)}" if crit else ""
         claim = f"half of the skill is gone at λ = {edge():g} or below"
         yield finding_between(claim, crossed, edge(), evidence, main=True)
-
-
-def _answer(variants: Mapping[str, Any]) -> str:
-    crossed = half_gone_by_seed(variants)
-    return f"Half of the skill on the targets is gone at λ = {half_gone_text(crossed) if crossed else 'unknown'}."
 
 
 def half_gone_by_seed(variants: Mapping[str, Any]) -> list[Between]:

@@ -35,7 +35,6 @@ def sampler_study(samplers: tuple[str, ...] = SAMPLERS) -> Study:
         "Adaptive sampling and the wrench resist forgetting and cost the kept clips.",
         lambda lab: ablation(samplers),
         findings=lambda document: findings(document["results"]["variants"], main=True),
-        answer=lambda document: answer(document["results"]["variants"]),
         theirs=paper.ABLATION,
         asked=lambda lab: asked,
     )
@@ -81,11 +80,6 @@ def findings(variants: Mapping[str, Any], prefix: str = "", *, main: bool = Fals
             if change:
                 evidence = f"{group} tracking minus that with {other} {number(change, 2)}; bound 0"
                 yield finding(claim, change, 0.0, evidence, below=group == "kept", main=main)
-
-
-def answer(variants: Mapping[str, Any], prefix: str = "") -> str:
-    """What was measured, for a reader."""
-    return "; ".join(found.evidence for found in findings(variants, prefix))
 
 
 def effect(variants: Mapping[str, Any], pairs: Sequence[tuple[str, str]], group: str) -> Estimate | None:

@@ -32,9 +32,9 @@ class Study:
         body: (document) → the page's tables and what a reader must know of them, in Markdown.
         draw: (document) → its figure.
         findings: (document) → what the numbers say of the paper's claims; the main ones answer `claim`.
-        answer: (document) → what was measured of `claim`, in one sentence with its numbers.
         iterations: of each trial, by preset.
         asked: (lab) → what the results depend on beside the options, such as the values of a sweep.
+        answer: (document) → what was measured of `claim`, in one sentence; by default the main findings' evidence.
         watches: whether it reads the evaluations during training, which have `watched_episodes`.
     """
 
@@ -45,9 +45,9 @@ class Study:
     body: Callable[[Document], str]
     draw: Callable[[Document], Figure]
     findings: Callable[[Document], Iterable[Finding]]
-    answer: Callable[[Document], str]
     iterations: Mapping[str, int] = field(default_factory=lambda: ITERATIONS)
     asked: Callable[[Lab], Mapping[str, Any]] = lambda lab: {}
+    answer: Callable[[Document], str] | None = None
     watches: bool = False
 
 

@@ -378,7 +378,7 @@ def test_the_comparison_asks_for_every_method_and_every_sampler_with_and_without
     def stand_in(asked, **_):
         for trial in asked:
             given = parse(unlearn.Options, "unlearn", trial.flags)
-            asked_for[given.method, given.penalty, given.sampler, given.wrench, given.clips, given.seed] = given
+            asked_for[given.method, given.penalty or 16.0, given.sampler, given.wrench, given.clips, given.seed] = given
             if not trial.folder.exists():
                 shutil.copytree(watched_run.folder, trial.folder)
         return {}
