@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import hashlib
 import os
@@ -50,6 +51,16 @@ def code_hash(package: Path) -> str:
         file = path.read_bytes()
         content.update(f"{path.relative_to(package).as_posix()}:{len(file)}:".encode() + file)
     return content.hexdigest()[:8]
+
+
+def made_here() -> Provenance:
+    """`provenance` of numbers that JAX computes here: on an accelerator, its name stands before the processor's."""
+    import jax
+
+    made = provenance()
+    if jax.default_backend() == "cpu":
+        return made
+    return dataclasses.replace(made, processor=f"{jax.devices()[0].device_kind}, {made.processor}")
 
 
 def commit(package: Path) -> str:

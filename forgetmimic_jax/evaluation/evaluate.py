@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-import jax
-
 from forgetmimic_jax.basics.console import progress
 from forgetmimic_jax.basics.files import write_atomically
-from forgetmimic_jax.basics.provenance import provenance
+from forgetmimic_jax.basics.provenance import made_here
 from forgetmimic_jax.evaluation.document import FILE, SCHEMA, EvaluationDocument, write_evaluation
 from forgetmimic_jax.evaluation.metrics import ZERO_ACTION
 from forgetmimic_jax.evaluation.rollout import Evaluator
@@ -56,9 +53,6 @@ def evaluate(
         for done, (name, policy) in enumerate(everyone.items(), start=1):
             rollouts[name] = evaluator.rollout(policy)
             report(done, sum(int(rollout.length.sum()) for rollout in rollouts.values()), {})
-    made = provenance()
-    if jax.default_backend() != "cpu":
-        made = dataclasses.replace(made, processor=f"{jax.devices()[0].device_kind}, {made.processor}")
     return EvaluationDocument(
         schema=SCHEMA,
         robot=setup.robot.name,
@@ -70,7 +64,7 @@ def evaluate(
         targets=list(targets),
         policies=evaluate_policies(rollouts, setup.library.names, targets, seed=seed),
         budget={name: {"environment_steps": subject.environment_steps} for name, subject in subjects.items()},
-        made=made,
+        made=made_here(),
         policy_hashes={name: subject.policy_hash for name, subject in subjects.items()},
     )
 

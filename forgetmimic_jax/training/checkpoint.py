@@ -28,6 +28,7 @@ from jax import Array
 from safetensors.numpy import load_file, save_file
 
 from forgetmimic_jax.basics.errors import InputError
+from forgetmimic_jax.basics.provenance import made_here
 from forgetmimic_jax.policy.policy import Policy, init_policy
 from forgetmimic_jax.ppo.state import TrainState
 from forgetmimic_jax.robot.model import Robot
@@ -56,6 +57,7 @@ class CheckpointInfo:
     environment_steps: int
     files: dict[str, str]  # sha256 of policy.safetensors and of each file of run/
     base: str | None  # `policy_hash` of the checkpoint that unlearning started from
+    made: dict[str, Any]  # its Provenance; empty in a checkpoint of an earlier version
 
 
 @dataclass(frozen=True)
@@ -101,6 +103,7 @@ def _save(
         "clips": list(setup.library.names),
         "library_hash": setup.library_hash,
         **dataclasses.asdict(progress),
+        "made": dataclasses.asdict(made_here()),
     }
     tensors = {name: np.array(values, order="C") for name, values in _named(policy).items()}
     tensors[FAILURE_LEVEL] = np.array(failure_level, order="C")
@@ -157,6 +160,7 @@ def read_info(path: Path) -> CheckpointInfo:
             environment_steps=int(meta["environment_steps"]),
             files=dict(meta["files"]),
             base=meta.get("base"),
+            made=dict(meta.get("made", {})),
         )
     except FileNotFoundError:
         newest = newest_checkpoint(path)

@@ -23,7 +23,7 @@ from forgetmimic_jax.training import checkpoint
 from forgetmimic_jax.training.checkpoint import Progress, checkpoints, newest_checkpoint
 from forgetmimic_jax.training.folder import BEST, prepare_folder
 from forgetmimic_jax.training.log import Log
-from forgetmimic_jax.training.start import base_checkpoint, saved_state, start_state, steps_before
+from forgetmimic_jax.training.start import another_machine, base_checkpoint, saved_state, start_state, steps_before
 from forgetmimic_jax.training.watch import Watch
 from forgetmimic_jax.unlearning.registry import method_of
 
@@ -52,6 +52,8 @@ def run(setup: Setup, directory: Path, *, description: str, resume: bool = False
     iterate = make_iteration(env, method_of(config))
     directory.mkdir(parents=True, exist_ok=True)
     console = Console()
+    if newest and (difference := another_machine(newest)):
+        console.print(difference, highlight=False, markup=False, soft_wrap=True)
     saved = newest
 
     def save() -> Path:

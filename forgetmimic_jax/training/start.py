@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from forgetmimic_jax.basics.errors import InputError
+from forgetmimic_jax.basics.provenance import made_here
 from forgetmimic_jax.motion.library import DATA_DIR
 from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.ppo.state import TrainState, init_state
@@ -94,6 +95,18 @@ def saved_state(setup: Setup, env: Environment, assets: Assets, path: Path) -> t
     if step_size != info.config.ppo.learning_rate:  # changed with --set; else the state's own holds
         state = dataclasses.replace(state, learning_rate=jnp.asarray(step_size, jnp.float32))
     return state, info.environment_steps
+
+
+def another_machine(path: Path) -> str | None:
+    """What a run says that resumes from checkpoint `path` on another machine; None on the machine of before.
+
+    Another processor, or another number of cores, adds floating-point numbers in another order.
+    """
+    before, here = checkpoint.read_info(path).made, dataclasses.asdict(made_here())
+    then, now = (f"{made.get('processor')} (cores: {made.get('cores')})" for made in (before, here))
+    if not before or then == now:
+        return None
+    return f"{path} was made on {then}, this is {now}: the numbers will differ in the last digits"
 
 
 def steps_before(config: Config) -> int:

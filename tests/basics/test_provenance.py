@@ -1,16 +1,18 @@
+import dataclasses
 import os
 import platform
 import re
 import subprocess
 from importlib.metadata import version
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import mujoco
 import pytest
 
 from forgetmimic_jax.basics import provenance as module
-from forgetmimic_jax.basics.provenance import PACKAGE, code_hash, commit, provenance
+from forgetmimic_jax.basics.provenance import PACKAGE, code_hash, commit, made_here, provenance
 
 
 def git(folder: Path, *arguments: str) -> str:
@@ -99,3 +101,10 @@ def test_this_process(monkeypatch):
     if hasattr(os, "sched_getaffinity"):
         monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 3, 5})
         assert module.cores() == 3
+
+
+def test_an_accelerator_stands_before_the_processor(monkeypatch):
+    assert made_here() == provenance()
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(jax, "devices", lambda: [SimpleNamespace(device_kind="Abacus")])
+    assert made_here() == dataclasses.replace(provenance(), processor=f"Abacus, {provenance().processor}")

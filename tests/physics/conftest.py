@@ -5,9 +5,9 @@ from forgetmimic_jax.physics.native import NativeEngine
 from forgetmimic_jax.robot.model import Robot, load_robot
 
 
-@pytest.fixture(scope="session")
-def robot() -> Robot:
-    return load_robot("g1")
+@pytest.fixture(scope="session", params=["g1", "h2"])
+def robot(request) -> Robot:
+    return load_robot(request.param)
 
 
 @pytest.fixture(scope="session")

@@ -160,7 +160,10 @@ def test_only_pairs_of_floor_and_robot_make_contacts(robot, engine):
     capsules = int((touches & (model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE)).sum())
     assert spheres + capsules == touches.sum()
     assert engine.num_contacts == spheres + 2 * capsules  # a capsule lies on a plane with both ends
-    assert MjxEngine(load_robot("g1", PhysicsConfig(self_collision=True)), SUBSTEPS).num_contacts > engine.num_contacts
+    assert (
+        MjxEngine(load_robot(robot.name, PhysicsConfig(self_collision=True)), SUBSTEPS).num_contacts
+        > engine.num_contacts
+    )
 
 
 def test_warp_has_room_for_every_contact_and_joint_limit(robot, engine):

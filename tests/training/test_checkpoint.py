@@ -14,6 +14,7 @@ import yaml
 from trees import assert_same
 
 from forgetmimic_jax.basics.errors import InputError
+from forgetmimic_jax.basics.provenance import provenance
 from forgetmimic_jax.ppo.state import TrainState
 from forgetmimic_jax.tracking.env import make_assets, make_environment
 from forgetmimic_jax.tracking.rsi import Bins
@@ -73,6 +74,7 @@ def test_the_note_says_what_it_belongs_to(saved, setup):
     assert (info.robot, info.clips, info.iteration, info.environment_steps) == ("g1", ("sway", "turn", "nod"), 7, STEPS)
     assert info.joints == setup.robot.joint_names
     assert info.library_hash == setup.library_hash
+    assert info.made == dataclasses.asdict(provenance())
 
 
 def test_without_the_run_it_is_a_policy_that_cannot_be_resumed(tmp_path, state, setup, template):

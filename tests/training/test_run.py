@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import errno
+import json
 import os
 import shutil
 import signal
@@ -18,6 +19,7 @@ from tensorboardX.proto.event_pb2 import Event
 
 from forgetmimic_jax.basics.errors import InputError, Interrupted
 from forgetmimic_jax.basics.files import read_rows
+from forgetmimic_jax.basics.provenance import provenance
 from forgetmimic_jax.evaluation.metrics import Rollout
 from forgetmimic_jax.tracking.env import make_assets, make_environment
 from forgetmimic_jax.tracking.setup import Setup, check_targets, make_setup
@@ -204,6 +206,21 @@ def test_a_finished_run_resumes_to_its_own_end(run):
     path, state = run(resume=True)
     assert (path.name, int(state.iteration)) == ("00000040", 40)
     assert (run.folder / "metrics.jsonl").read_text() == before
+
+
+def test_a_resume_on_another_machine_says_that_the_last_digits_differ(run, capsys):
+    run(iterations=5)
+    capsys.readouterr()
+    run(iterations=6, resume=True)
+    assert "digits" not in capsys.readouterr().out
+    path = run.folder / "checkpoints" / "00000006"
+    note = json.loads((path / "meta.json").read_text())
+    note["made"] |= {"processor": "Abacus", "cores": 99}
+    (path / "meta.json").write_text(json.dumps(note))
+    run(iterations=7, resume=True)
+    here = f"{provenance().processor} (cores: {provenance().cores})"
+    expected = f"{path} was made on Abacus (cores: 99), this is {here}: the numbers will differ in the last digits"
+    assert expected in capsys.readouterr().out.splitlines()
 
 
 def test_more_iterations_are_remembered_by_the_next_resume(run):
