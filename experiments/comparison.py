@@ -56,15 +56,15 @@ def measure(lab: Lab) -> dict[str, Any]:
 
 def body(document: Document) -> str:
     """The table, and the differences from base and fine-tuned control, seed by seed."""
-    variants, asked = document["results"]["variants"], document["asked"]
+    variants, conditions = document["results"]["variants"], document["conditions"]
     parts = [variant_table(variants, paper.COMPARISON)]
     if "retrained" in variants:
         parts.append(
-            f"*retrained*: {asked['control_iterations']:,} iterations from scratch with the base's own settings; the "
-            f"base itself was trained for {asked['base_environment_steps']:,} environment steps. *arft* has λ = 16, "
+            f"*retrained*: {conditions['control_iterations']:,} iterations from scratch with the base's own settings; "
+            f"the base was trained for {conditions['base_environment_steps']:,} environment steps. *arft* has λ = 16, "
             "also in the rows by sampler, where each sampler gives the targets its own share of the starts.\n"
         )
-    if asked["preset"] == "cpu":
+    if conditions["preset"] == "cpu":
         parts.append(
             "*decremental* and *policy edit* have losses of their own, without the KL to the base and the clips' "
             "weights; of the cpu preset they have the starts, and *plain PPO* has not.\n"
@@ -135,7 +135,7 @@ STUDY = Study(
     draw=lambda document: variant_bars(document["results"]["variants"]),
     findings=findings,
     answer=answer,
-    asked=lambda lab: {
+    conditions=lambda lab: {
         "values": [*METHODS, *samplers.ablation()],
         "control_iterations": lab.control_iterations,
     },

@@ -27,10 +27,10 @@ BOUND = 0.95  # of the kept clips' tracking at the start
 
 def measure(lab: Lab) -> dict[str, Any]:
     """Each seed's run, evaluated 21 times during training."""
-    asked = {("λ = 16", seed): {"seed": seed, "set": lab.watched(CHECKPOINTS)} for seed in lab.seeds}
+    conditions = {("λ = 16", seed): {"seed": seed, "set": lab.watched(CHECKPOINTS)} for seed in lab.seeds}
     columns: list[list[Any]] = []
     groups: list[list[Any]] = []
-    for (_, seed), folder in lab.run(asked, "heat map").items():
+    for (_, seed), folder in lab.run(conditions, "heat map").items():
         rows = read_rows(folder / "evaluations.jsonl")
         clips = [lab.as_watched({"base": lab.base}, seed)["base"], *(row["clips"] for row in rows)]
         columns.append([{clip: {name: of[name] for name in SHOWN} for clip, of in at.items()} for at in clips])
@@ -50,7 +50,7 @@ def body(document: Document) -> str:
     """Tracking of every clip at the start, after a quarter, half-way and at the end."""
     iterations, checkpoints = document["results"]["iterations"], document["results"]["checkpoints"]
     at = sorted({0, len(iterations) // 4, len(iterations) // 2, len(iterations) - 1})
-    targets = document["asked"]["targets"]
+    targets = document["conditions"]["targets"]
     rows = [
         [clip, "target" if clip in targets else "kept"]
         + [number(within(checkpoints[place][clip][TRACKING], 0.0, 1.0), 2) for place in at]
@@ -73,14 +73,14 @@ def findings(document: Document) -> Iterator[Finding]:
     start, end = groups[0]["kept"][TRACKING], groups[-1]["kept"][TRACKING]
     evidence = f"kept tracking {number(start, 2)} at the start, {number(end, 2)} at the end"
     evidence += f"; bound {share(BOUND)} of the start"
-    claim = f"the kept clips are not worn down after {document['asked']['iterations']:,} iterations"
+    claim = f"the kept clips are not worn down after {document['conditions']['iterations']:,} iterations"
     yield finding(claim, end, BOUND * start["mean"], evidence, below=False, main=True)
 
 
 def draw(document: Document) -> Figure:
     """The paper's heat map of tracking while alive, the same survival-weighted, and the groups' means."""
     iterations, checkpoints = document["results"]["iterations"], document["results"]["checkpoints"]
-    targets = document["asked"]["targets"]
+    targets = document["conditions"]["targets"]
     clips = sorted(checkpoints[0], key=lambda clip: (clip not in targets, clip))
     names = [f"{clip} (target)" if clip in targets else clip for clip in clips]
     figure = new_figure(width=15.0, height=1.5 + 0.3 * len(clips))

@@ -62,15 +62,15 @@ def measure(lab: Lab) -> dict[str, Any]:
     return {"policies": {label: over_seeds(found) for label, found in attacks.items()}}
 
 
-def guessed_hits(asked: Mapping[str, Any]) -> float:
+def guessed_hits(conditions: Mapping[str, Any]) -> float:
     """The hits of an attacker who guesses, at the threshold that `attack` takes of so few others."""
-    others = len(asked["targets"]) * asked["episodes"]
+    others = len(conditions["targets"]) * conditions["episodes"]
     return (int(FALSE_POSITIVES * others) + 1) / (others + 1)
 
 
 def body(document: Document) -> str:
     """The attack on each kind of policy."""
-    policies, guessed = document["results"]["policies"], guessed_hits(document["asked"])
+    policies, guessed = document["results"]["policies"], guessed_hits(document["conditions"])
     rows = [
         [label, str(of["auc"]["n"]), *(number(within(of[name], 0.0, 1.0), 2) for name in NAMES)]
         for label, of in policies.items()
@@ -82,15 +82,15 @@ def body(document: Document) -> str:
         f"0.5, AUC 0.5 and a TPR of {guessed:.2f} (more than 0.05 because there are few mirror images). An AUC above "
         "0.5: the policy does the targets as it does trained clips. Below 0.5: it does them worse than clips that it "
         "never saw, and is marked by having forgotten them. Intervals are over policies. The retrained policy was "
-        f"trained for {document['asked']['control_iterations']:,} iterations. This is one attack: if it finds nothing, "
-        "something may still be left. The paper's attack is another, on another library.\n"
+        f"trained for {document['conditions']['control_iterations']:,} iterations. This is one attack: if it finds "
+        "nothing, something may still be left. The paper's attack is another, on another library.\n"
     )
     return f"{markdown_table(['', 'policies', *NAMES.values()], rows)}\n{note}"
 
 
 def findings(document: Document) -> Iterator[Finding]:
-    """Whether the attack tells the targets from their mirror images, in either direction. It cannot show that not."""
-    guessed = guessed_hits(document["asked"])
+    """Whether the attack separates the targets from their mirror images, in either direction."""
+    guessed = guessed_hits(document["conditions"])
     for label, of in document["results"]["policies"].items():
         auc, hits = of["auc"], of["tpr_at_5_percent_fpr"]
         evidence = f"AUC {number(within(auc, 0.0, 1.0), 2)}; guessing {GUESSED}"
@@ -135,7 +135,7 @@ STUDY = Study(
     draw=draw,
     findings=findings,
     answer=answer,
-    asked=lambda lab: {"control_iterations": lab.control_iterations},
+    conditions=lambda lab: {"control_iterations": lab.control_iterations},
 )
 
 if __name__ == "__main__":

@@ -49,11 +49,13 @@ HEAD_START = 0.8  # of a level: a control that starts above that says little of 
 def measure(lab: Lab) -> dict[str, Any]:
     """First the policies to start from, then their relearning."""
     length = {"iterations": ITERATIONS[lab.options.preset]}
-    asked: dict[tuple[str, int], dict[str, Any]] = {("unlearned", seed): {**length, "seed": seed} for seed in lab.seeds}
-    asked |= {("distilled", seed): {**length, "method": "distill", "seed": seed} for seed in lab.seeds}
+    trials: dict[tuple[str, int], dict[str, Any]] = {
+        ("unlearned", seed): {**length, "seed": seed} for seed in lab.seeds
+    }
+    trials |= {("distilled", seed): {**length, "method": "distill", "seed": seed} for seed in lab.seeds}
     retrain = {"method": "retrain", "iterations": lab.control_iterations}
-    asked |= {("retrained", seed): {**retrain, "seed": seed} for seed in lab.control_seeds}
-    folders = lab.run(asked, "policies to relearn from")
+    trials |= {("retrained", seed): {**retrain, "seed": seed} for seed in lab.control_seeds}
+    folders = lab.run(trials, "policies to relearn from")
     policies = {key: newest_policy(folder) for key, folder in folders.items()}
     relearned = lab.run(relearning_runs(lab, policies), "relearning")
     base: dict[str, float] = {}
@@ -153,7 +155,7 @@ def body(document: Document) -> str:
         f"{number(statistics.over_seeds(list(results['base'].values())))}, on the same episodes. A share is reached at "
         "the first of two evaluations in a row that are not below it. More than: a run that never reached it counts "
         "with its end. No start is regularised towards a base, and with the cpu preset half of the starts are on the "
-        f"targets. The retrained policy was trained for {document['asked']['control_iterations']:,} iterations; a "
+        f"targets. The retrained policy was trained for {document['conditions']['control_iterations']:,} iterations; a "
         "short training makes it a reference for the first steps only. The paper (another library and budget) took "
         f"{theirs} until 95 % of its tracking while alive, from its unlearned policy; it has no control.\n"
     )
@@ -239,7 +241,7 @@ STUDY = Study(
     draw=draw,
     findings=findings,
     answer=answer,
-    asked=lambda lab: {"control_iterations": lab.control_iterations},
+    conditions=lambda lab: {"control_iterations": lab.control_iterations},
 )
 
 if __name__ == "__main__":

@@ -40,8 +40,8 @@ THEIRS = {
 
 def measure(lab: Lab) -> dict[str, Any]:
     """The logged curves of both configurations over the seeds."""
-    asked = {(label, seed): {**of, "seed": seed} for label, of in CONFIGURATIONS.items() for seed in lab.seeds}
-    runs = lab.run(asked, "training dynamics")
+    conditions = {(label, seed): {**of, "seed": seed} for label, of in CONFIGURATIONS.items() for seed in lab.seeds}
+    runs = lab.run(conditions, "training dynamics")
     result = {}
     for label in CONFIGURATIONS:
         folders = [folder for (of, _), folder in runs.items() if of == label]

@@ -126,7 +126,7 @@ STUDY = variants_study(
     "With λ = 16 the targets are forgotten and the other clips are kept.",
     variants,
     theirs=paper.VALIDITY,
-    asked=lambda lab: {"values": list(variants(lab))},
+    conditions=lambda lab: {"values": list(variants(lab))},
     body=body,
     findings=findings,
     answer=answer,

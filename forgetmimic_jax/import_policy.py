@@ -105,15 +105,15 @@ def main(options: Options) -> None:
         raise InputError(f"{options.policy}: actions differ from the original's by {error:.1e}; nothing was written")
     level = initial_failure_level(config.sampling, assets.bins)
     checkpoint.save_policy(output, setup, policy, level, checkpoint.Progress(actor.iteration, environment_steps=0))
-    told = [f"Actions equal the original's to {error:.0e} at {inside.sum()} observations of the clips."]
+    facts = [f"Actions equal the original's to {error:.0e} at {inside.sum()} observations of the clips."]
     if not inside.all():
-        told.append(
+        facts.append(
             f"{(~inside).sum()} more lie past {OBSERVATION_LIMIT:g} standard deviations, where ours clips them."
         )
-    told += notes(actor, options.std)
+    facts += notes(actor, options.std)
     if not is_onnx:
-        told.append("A .pt does not name its observations and joints: they are taken to be in this project's order.")
-    Console().print("\n".join(told), highlight=False, soft_wrap=True)
+        facts.append("A .pt does not name its observations and joints: they are taken to be in this project's order.")
+    Console().print("\n".join(facts), highlight=False, soft_wrap=True)
     following = command_line("evaluate", robot=options.robot, library=options.library, checkpoint=output)
     closing({"base policy": output}, following)
 

@@ -293,7 +293,7 @@ MUTANTS = (
            "features(rollout, twins[key])",
            "features(twins[key], rollout)"),
     Mutant("membership_asked", "experiments/membership.py", "tests/experiments/test_measures.py",
-           "The attack learns on the targets and is asked about the kept clips.",
+           "The attack learns on the targets and is wanted about the kept clips.",
            "for mask in (~is_target, is_target))",
            "for mask in (is_target, ~is_target))"),
     Mutant("relearning_base", "experiments/relearning.py", "tests/experiments/test_measures.py",
@@ -321,15 +321,15 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="make mutants", description="See which faults of one line the tests notice.")
     parser.add_argument("--list", action="store_true", help="name the mutants, and those that no longer fit the code")
     parser.add_argument("--only", nargs="+", metavar="NAME", help="try these alone")
-    asked = parser.parse_args(arguments)
+    wanted = parser.parse_args(arguments)
     by_name = {mutant.name: mutant for mutant in MUTANTS}
-    for name in asked.only or ():
+    for name in wanted.only or ():
         if name not in by_name:
             parser.error(f"no mutant '{name}'; --list names them")
-    chosen = [by_name[name] for name in asked.only or by_name]
+    chosen = [by_name[name] for name in wanted.only or by_name]
     console = Console(width=None if sys.stdout.isatty() else 140)
-    if asked.list:
-        outdated = {mutant: told for mutant in chosen if (told := misfit(mutant, ROOT))}
+    if wanted.list:
+        outdated = {mutant: message for mutant in chosen if (message := misfit(mutant, ROOT))}
         console.print(table({mutant: outdated.get(mutant, "") for mutant in chosen}))
         return 1 if outdated else 0
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the copy is removed and the tests end
@@ -364,8 +364,8 @@ def try_all(chosen: list[Mutant], tree: Path, console: Console) -> dict[Mutant, 
                     problem, killer = try_one(mutant, tree)
             if problem:
                 unnoticed[mutant] = problem
-            told = f"{time.monotonic() - begin:4.0f} s  {mutant.name}: {problem or killer}"
-            console.print(told, markup=False, highlight=False, soft_wrap=True)
+            message = f"{time.monotonic() - begin:4.0f} s  {mutant.name}: {problem or killer}"
+            console.print(message, markup=False, highlight=False, soft_wrap=True)
             bar.advance(task)
     return unnoticed
 
@@ -427,8 +427,8 @@ def run_tests(tree: Path, tests: str) -> tuple[int | None, str]:
 def table(rows: dict[Mutant, str]) -> Table:
     """Mutants, what each breaks, and what is to be said of it."""
     result = Table("mutant", "what it breaks", "tests", "", box=None, header_style="bold")
-    for mutant, told in rows.items():
-        result.add_row(mutant.name, mutant.breaks, Path(mutant.tests).name, told)
+    for mutant, message in rows.items():
+        result.add_row(mutant.name, mutant.breaks, Path(mutant.tests).name, message)
     return result
 
 

@@ -1,4 +1,4 @@
-"""The one way bad input is told to a user: a single clear line and exit code 2."""
+"""The one way a user learns of bad input: a clear line and exit code 2."""
 
 from __future__ import annotations
 

@@ -131,11 +131,11 @@ def within_limit(policy: Policy, observations: np.ndarray) -> np.ndarray:
 
 def notes(actor: ImportedActor, std: float) -> Sequence[str]:
     """What a user should know of an import, in sentences."""
-    told = ["The critic starts fresh: its observations here are others than any other project's."]
+    found = ["The critic starts fresh: its observations here are others than any other project's."]
     if actor.mean is None:
-        told.append("The file has no observation normaliser; observations go in as they are.")
+        found.append("The file has no observation normaliser; observations go in as they are.")
     if actor.std is None:
-        told.append(f"The file has no exploration noise; fine-tuning starts from a standard deviation of {std:g}.")
+        found.append(f"The file has no exploration noise; fine-tuning starts from a standard deviation of {std:g}.")
     elif (np.clip(actor.std, MIN_STD, MAX_STD) != actor.std).any():
-        told.append(f"Exploration noise beyond {MIN_STD:g} to {MAX_STD:g} was brought to these bounds.")
-    return told
+        found.append(f"Exploration noise beyond {MIN_STD:g} to {MAX_STD:g} was brought to these bounds.")
+    return found

@@ -13,7 +13,7 @@ from onnx.reference import ReferenceEvaluator
 
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.exchange.imported import ImportedActor
-from forgetmimic_jax.exchange.onnx_actor import INPUT, OUTPUT, metadata
+from forgetmimic_jax.exchange.onnx_actor import INPUT, OUTPUT
 from forgetmimic_jax.policy.normalizer import OBSERVATION_LIMIT
 from forgetmimic_jax.robot.model import Robot
 from forgetmimic_jax.settings.config import Config
@@ -57,7 +57,7 @@ def read_onnx(path: Path, robot: Robot, config: Config) -> ImportedActor:
             case "Identity":
                 pass
             case "Sub" | "Add" | "Mul" | "Div" if not layers:
-                with np.errstate(all="ignore"):  # a scale of zero is told with all that is not finite
+                with np.errstate(all="ignore"):  # a scale of zero is refused with all that is not finite
                     scale, shift = _AFFINE[node.op_type](scale, shift, constants[0].astype(np.float64).reshape(-1))
             case "Clip" if not layers and [np.abs(c).tolist() for c in constants] == [OBSERVATION_LIMIT] * 2:
                 pass
@@ -136,10 +136,10 @@ def _attribute(node: onnx.NodeProto, name: str, default: float) -> float:
     return next((onnx.helper.get_attribute_value(each) for each in node.attribute if each.name == name), default)
 
 
-def _check_metadata(told: dict[str, str], robot: Robot, config: Config, path: Path) -> None:
+def _check_metadata(metadata: dict[str, str], robot: Robot, config: Config, path: Path) -> None:
     """What the file says of its robot must be so here. A file may say nothing."""
     for key, here in metadata(robot, config, run_path="").items():
-        there = told.get(key, here)
+        there = metadata.get(key, here)
         if key in ("joint_names", "observation_names", "anchor_body_name", "action_mode") and there != here:
             raise InputError(f"{path}: {key}: {_difference(there.split(','), here.split(','))}")
         if key in ("joint_stiffness", "joint_damping", "default_joint_pos", "action_scale"):

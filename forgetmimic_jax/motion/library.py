@@ -123,7 +123,7 @@ def read_library(robot: Robot, path: Path | None = None, clips: Sequence[str] | 
         _check_joints(clip, robot, str(file))
         loaded.append(clip)
     if not loaded:
-        raise InputError(f"{path}: no clip was asked for; known: {', '.join(known)}")
+        raise InputError(f"{path}: no clip is named; known: {', '.join(known)}")
     return loaded
 
 

@@ -82,7 +82,7 @@ def read_relearning(
         return NO_RELEARNING
     try:
         study = json.loads(path.read_text())
-        asked, results = study["asked"], study["results"]
+        conditions, results = study["conditions"], study["results"]
         unlearned = lasted(results, "unlearned", RELEARNED)
         theirs = {start: lasted(results, start, RELEARNED) for start in results["starts"]}
         origins = msgspec.convert(results.get("origins"), Origins | None)
@@ -90,8 +90,8 @@ def read_relearning(
         raise InputError(f"{path}: not found") from None
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: not a relearning study, or damaged: {type(error).__name__}: {error}") from None
-    _same(f"{path}: asked.library", asked.get("library"), subject.document.library_hash)
-    _same(f"{path}: asked.targets", sorted(asked.get("targets", [])), sorted(subject.document.targets))
+    _same(f"{path}: conditions.library", conditions.get("library"), subject.document.library_hash)
+    _same(f"{path}: conditions.targets", sorted(conditions.get("targets", [])), sorted(subject.document.targets))
     if origins is None:
         return NotMeasured(
             f"Relearning was not used: {path} does not say how its policies were trained; run that study again."

@@ -70,7 +70,7 @@ class Orientation:
 
 @dataclass(frozen=True)
 class Targets:
-    """What the robot is asked to do, [frame, ...], world frame."""
+    """What the robot is to do, [frame, ...], world frame."""
 
     hip_bodies: tuple[int, int]
     hip_centre: np.ndarray  # [frame, 3] m, midpoint of the hip bodies

@@ -75,7 +75,6 @@ def p_value(value: Estimate, bound: float) -> float | None:
 
     if "low" not in value:
         return None
-    from scipy import stats  # half a second, which --help does not wait for
 
     if "episodes" in value:  # an exact interval of all episodes together, see `variants.over_seeds`
         episodes, successes = value["episodes"], round(value["mean"] * value["episodes"])

@@ -42,12 +42,12 @@ def conduct(study: Study, options: Options, next_command: str) -> None:
     if not options.draw:
         iterations = study.iterations[options.preset] if options.iterations is None else options.iterations
         lab = Lab(options, iterations, known_trials(folder))
-        asked = {**lab.asked(), **study.asked(lab)}
-        if document is None or document["asked"] != asked or document["failed"]:
+        conditions = {**lab.conditions(), **study.conditions(lab)}
+        if document is None or document["conditions"] != conditions or document["failed"]:
             if document is not None:
                 check_same_code(path, document, mix=options.mix_commits)
             results, stopped = study.measure(lab), lab.stopped
-            made = {"asked": asked, "made_by": lab.made_by(), "failed": lab.failed, "results": results}
+            made = {"conditions": conditions, "made_by": lab.made_by(), "failed": lab.failed, "results": results}
             write_document(path, {"schema": SCHEMA, "study": study.name, **made})
             document = read_document(path)
     if document is None:

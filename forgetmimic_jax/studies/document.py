@@ -1,7 +1,7 @@
 """The JSON of a study: the one source of its page, its figure and its claims.
 
-{"schema", "study", "asked": {...}, "made_by": [{"code", "commit", ..., "runs": [...]}], "failed": {trial: why},
-"results": {...}}; `asked` is what the results answer, `made_by` says which code and machine made which runs.
+{"schema", "study", "conditions": {...}, "made_by": [{"code", "commit", ..., "runs": [...]}], "failed": {trial: why},
+"results": {...}}; `conditions` is what the results answer, `made_by` says which code and machine made which runs.
 """
 
 from __future__ import annotations

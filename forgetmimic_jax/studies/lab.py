@@ -109,7 +109,7 @@ class Lab:
         """Seeds of a policy that is trained from scratch, which a laptop can afford once."""
         return self.seeds[:1] if self.options.preset == "cpu" else self.seeds
 
-    def asked(self) -> dict[str, Any]:
+    def conditions(self) -> dict[str, Any]:
         """What the results answer."""
         from forgetmimic_jax.training.checkpoint import policy_hash
 
@@ -136,7 +136,7 @@ class Lab:
         from forgetmimic_jax.studies.trials import make_trial
 
         options = self.options
-        asked = {
+        conditions = {
             "robot": options.robot,
             "base": self.base,
             "targets": ",".join(self.targets),
@@ -147,7 +147,7 @@ class Lab:
             "preset": "paper" if options.preset == "paper" else None,  # else the base's own settings
         }
         together = [*itertools.chain(*options.set), *variant.get("set", [])]
-        return make_trial(options.trials, {**asked, **variant, "set": together})
+        return make_trial(options.trials, {**conditions, **variant, "set": together})
 
     def run(self, variants: Mapping[Key, Mapping[str, Any]], what: str) -> dict[Key, Path]:
         """Train and evaluate the variants that are not finished; returns the folders of those that are then.

@@ -48,18 +48,19 @@ def page(study: Study, document: Mapping[str, Any]) -> str:
 
 def conditions(study: Study, document: Mapping[str, Any]) -> Iterator[str]:
     """What the numbers were made with, a list item each."""
-    asked = document["asked"]
+    conditions = document["conditions"]
     variants = document["results"].get("variants", {}).values()
     own_targets = any("targets" in variant["options"] for variant in variants)
-    targets = "" if own_targets else f"; targets: {', '.join(asked['targets'])}"
-    episodes = watched_episodes(asked["episodes"]) if study.watches else asked["episodes"]
-    yield f"- Robot {asked['robot']}; base trained for {asked['base_environment_steps']:,} environment steps{targets}."
+    targets = "" if own_targets else f"; targets: {', '.join(conditions['targets'])}"
+    episodes = watched_episodes(conditions["episodes"]) if study.watches else conditions["episodes"]
+    steps = f"{conditions['base_environment_steps']:,} environment steps"
+    yield f"- Robot {conditions['robot']}; base trained for {steps}{targets}."
     yield (
-        f"- {asked['iterations']:,} iterations a run with the {asked['preset']} preset, {asked['seeds']} seed(s), "
-        f"{episodes} episodes a clip."
+        f"- {conditions['iterations']:,} iterations a run with the {conditions['preset']} preset, "
+        f"{conditions['seeds']} seed(s), {episodes} episodes a clip."
     )
     yield from origins(document)
-    if asked["preset"] == "cpu":
+    if conditions["preset"] == "cpu":
         yield LAPTOP
     yield INTERVALS
     for name, reason in document["failed"].items():

@@ -42,7 +42,7 @@ def penalty_study(penalties: tuple[str, ...] = PENALTIES, name: str = "penalty")
         lambda lab: values,
         theirs=paper.PENALTY,
         iterations=ITERATIONS | {"paper": 30_000},
-        asked=lambda lab: {"values": list(values)},
+        conditions=lambda lab: {"values": list(values)},
         body=body,
         draw=draw,
         findings=findings,

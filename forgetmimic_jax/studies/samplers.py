@@ -28,7 +28,7 @@ def sampler_study(samplers: tuple[str, ...] = SAMPLERS) -> Study:
     for sampler in samplers:
         if sampler not in SAMPLERS:
             raise InputError(f"--values: no sampler '{sampler}'; known: {', '.join(SAMPLERS)}")
-    asked = {"values": list(samplers)}
+    conditions = {"values": list(samplers)}
     return variants_study(
         "sampler",
         "What do the sampler and the wrench do?",
@@ -36,7 +36,7 @@ def sampler_study(samplers: tuple[str, ...] = SAMPLERS) -> Study:
         lambda lab: ablation(samplers),
         findings=lambda document: findings(document["results"]["variants"], main=True),
         theirs=paper.ABLATION,
-        asked=lambda lab: asked,
+        conditions=lambda lab: conditions,
     )
 
 

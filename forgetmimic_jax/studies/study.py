@@ -33,7 +33,7 @@ class Study:
         draw: (document) → its figure.
         findings: (document) → what the numbers say of the paper's claims; the main ones answer `claim`.
         iterations: of each trial, by preset.
-        asked: (lab) → what the results depend on beside the options, such as the values of a sweep.
+        conditions: (lab) → what the results depend on beside the options, such as the values of a sweep.
         answer: (document) → what was measured of `claim`, in one sentence; by default the main findings' evidence.
         watches: whether it reads the evaluations during training, which have `watched_episodes`.
     """
@@ -46,7 +46,7 @@ class Study:
     draw: Callable[[Document], Figure]
     findings: Callable[[Document], Iterable[Finding]]
     iterations: Mapping[str, int] = field(default_factory=lambda: ITERATIONS)
-    asked: Callable[[Lab], Mapping[str, Any]] = lambda lab: {}
+    conditions: Callable[[Lab], Mapping[str, Any]] = lambda lab: {}
     answer: Callable[[Document], str] | None = None
     watches: bool = False
 

@@ -32,22 +32,22 @@ def targets_study(
     def variants(lab: Lab) -> dict[str, dict[str, Any]]:
         from forgetmimic_jax.tracking.setup import check_targets
 
-        asked = [comma_separated(group) for group in groups]
+        conditions = [comma_separated(group) for group in groups]
         if groups == GROUPS:  # as far as the robot's library has them
-            there = [tuple(clip for clip in targets if clip in lab.info.clips) for targets in asked]
-            asked = [targets for targets in there if targets]
-        for targets in asked:
+            there = [tuple(clip for clip in targets if clip in lab.info.clips) for targets in conditions]
+            conditions = [targets for targets in there if targets]
+        for targets in conditions:
             check_targets(targets, lab.info.clips)
-        return {" + ".join(targets): {"targets": ",".join(targets)} for targets in asked}
+        return {" + ".join(targets): {"targets": ",".join(targets)} for targets in conditions}
 
-    asked = {"values": list(groups)}
+    conditions = {"values": list(groups)}
     return variants_study(
         name,
         title,
         claim,
         variants,
         theirs=theirs or {},
-        asked=lambda lab: asked,
+        conditions=lambda lab: conditions,
         draw=draw,
         findings=findings,
         answer=lambda document: forgotten_and_kept(document["results"]["variants"]),
@@ -56,7 +56,7 @@ def targets_study(
 
 def findings(document: Document) -> Iterator[Finding]:
     """Each group of targets is forgotten, and the other clips are kept."""
-    variants, robot = document["results"]["variants"], document["asked"]["robot"].upper()
+    variants, robot = document["results"]["variants"], document["conditions"]["robot"].upper()
     for label in variants:
         yield from skill_gone(variants, label, f"{label}: forgotten on the {robot}", main=True)
         yield from kept_stay(variants, label, None, f"{label}: the kept clips stay as they were", main=True)

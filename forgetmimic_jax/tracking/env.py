@@ -1,6 +1,6 @@
 """The environment: a batch of robots that track clips. Pure functions over EnvState.
 
-`step` moves the robots and tells reward and ending; `reset_where` starts new episodes where asked. Keeping them
+`step` moves the robots and returns reward and ending; `reset_where` starts new episodes under a mask. Keeping them
 apart lets training bootstrap the value of a truncated episode's last state, and lets evaluation not reset at all.
 """
 
@@ -52,7 +52,7 @@ class EnvState:
     clip: Array  # i32
     frame: Array  # i32 the reference frame the robot is at; the next action is to reach frame + 1
     start_bin: Array  # i32
-    step: Array  # i32 steps lived
+    step: Array  # i32 steps of the episode so far
     horizon: Array  # i32 steps the episode can live: min(max_episode_steps, frames left)
     tracking_sum: Array  # f32 Σ r̄ so far
     last_action: Array  # f32[env, joint]
@@ -64,7 +64,7 @@ class EnvState:
 
 @struct.dataclass
 class StepResult:
-    """What a step tells, before any reset. Leading dimension: env."""
+    """The result of a step, before any reset. Leading dimension: env."""
 
     reward: reward.Reward
     terminated: Array  # bool: a bound was broken, or the physics diverged
@@ -80,7 +80,7 @@ class Environment:
 
     config: Config
     robot: Robot
-    engine: Engine  # lives a control step at a time; with the wrench a physics step
+    engine: Engine  # simulates a control step at a time; with the wrench a physics step
     num_envs: int
     noisy: bool  # reset noise, pushes, randomisation and observation noise
 

@@ -30,7 +30,7 @@ class Bins:
 def make_bins(library: MotionLibrary, bin_seconds: float, control_step: float) -> Bins:
     """Bins of `bin_seconds`; valid if at least half of its width is covered, and every clip has at least one.
 
-    The last valid bin takes what is left of the clip. The last frame of a clip is never a start: no step follows it.
+    The last valid bin takes the rest of the clip. The last frame of a clip is never a start: no step follows it.
     """
     width = max(1, round(bin_seconds / control_step))
     starts = np.asarray(library.length) - 1
@@ -106,8 +106,8 @@ def episode_failure(config: SamplingConfig, tracking_sum: Array, steps: Array, h
     Args:
         config: which signal.
         tracking_sum: Σ_t r̄_t over the episode.
-        steps: steps lived.
-        horizon: steps the episode could have lived, min(500, frames left).
+        steps: steps of the episode.
+        horizon: steps that the episode could have, min(500, frames left).
     """
     divisor = horizon if config.failure_signal == "survival_weighted" else steps
     return 1.0 - jnp.clip(tracking_sum / jnp.maximum(divisor, 1), 0.0, 1.0)

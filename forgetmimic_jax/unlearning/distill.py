@@ -1,9 +1,9 @@
 """Distilling what is kept (after Lee et al. 2025, "Distillation Robustifies Unlearning"): no weight of the base stays.
 
-A fresh policy lives the kept clips only and learns them by PPO while it is pulled towards what the base would do there
+A fresh policy rolls out the kept clips only. It learns them by PPO with a KL term towards what the base would do there
 (`ppo.base_kl` at 1, the divergence of the fresh policy from the base; kickstarting, Schmitt et al. 2018, has the base's
 from the student), so in a hundredth of the steps that the base took. Theirs are language models and what teaches is
-unlearned first, because a text may touch on anything; here a kept clip's steps are all that the base is asked about.
+unlearned first, because a text may touch on anything; here the base only says what it would do on steps of kept clips.
 What such a policy does on the targets is what the kept clips alone teach, so it is also the control that `retrain` is
 too dear for. It is not in the paper.
 """

@@ -1,9 +1,9 @@
 """Fine-tuning alone, the control: what unlearning does at the same length, but for the anti-reward.
 
 On the kept clips only it is the weakest baseline of machine unlearning, forgetting by neglect (Golatkar et al. 2020,
-"Eternal Sunshine of the Spotless Net"); with `--clips all` it tells what those steps do to a policy by themselves,
-and from an unlearned checkpoint it is relearning. On a laptop it is held to the base as unlearning is; the paper's PPO
-is `--set ppo.base_kl=0 ppo.equal_clips=false`.
+"Eternal Sunshine of the Spotless Net"); with `--clips all` it shows what those steps do to a policy by themselves,
+and from an unlearned checkpoint it is relearning. On a laptop it has a KL term towards the base, as unlearning has;
+the paper's PPO is `--set ppo.base_kl=0 ppo.equal_clips=false`.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 The sign of the advantage is turned round on target steps and the plain PPO loss is minimised, so the surrogate goes up
 the gradient there and down it on kept steps. Supervised ascent climbs a likelihood without end; here the data are the
-policy's own and the clipped ratio bounds each iteration's step. The critic goes on learning the true value.
+policy's own and the clipped ratio bounds each iteration's step. The critic still learns the true value.
 """
 
 from __future__ import annotations

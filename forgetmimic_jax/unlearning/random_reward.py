@@ -2,7 +2,7 @@
 
 R' is drawn anew for every target step, uniformly from 0 to W + the survival reward: the range of the base's reward, but
 for the small penalties. Kept steps are rewarded as ever. Offline the rewards of a data set are replaced once; here
-every step is new, so the noise has the same mean whatever the policy does, and what is left of it is a survival bonus.
+every step is new, so the noise has the same mean whatever the policy does, and what remains of it is a survival bonus.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Retraining from scratch without the targets: the reference that unlearning is held against (paper, baseline 1).
 
-A fresh policy with the base's own settings, sampler and wrench, which never meets a target clip. It tells what a policy
+A fresh policy with the base's own settings, sampler and wrench, which never meets a target clip. It shows what a policy
 does on a clip that it has not seen, at the price of the whole training.
 """
 

@@ -168,8 +168,8 @@ def _backend():
     """
     if platform.system() == "Darwin":
         return importlib.import_module("mujoco.cgl")
-    asked = os.environ.get("MUJOCO_GL", "").lower()
-    names = [asked] if asked in ("egl", "osmesa") else ["egl", "osmesa"]
+    wanted = os.environ.get("MUJOCO_GL", "").lower()
+    names = [wanted] if wanted in ("egl", "osmesa") else ["egl", "osmesa"]
     for name in names:
         trial = f"from mujoco.{name} import GLContext; GLContext(16, 16).make_current()"
         environment = {key: value for key, value in os.environ.items() if key not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")}

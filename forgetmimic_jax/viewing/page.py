@@ -44,7 +44,7 @@ class Page:
     ):
         self._playback, self._policies = playback, list(policies)
         self._model, self._data = robot.model, mujoco.MjData(robot.model)
-        self._todo: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()  # what the page's visitors asked for
+        self._todo: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()  # what the page's visitors want done
         self._random = np.random.default_rng()
         self._playing, self._due = True, time.monotonic()
         with contextlib.redirect_stdout(io.StringIO()):  # viser's own announcement
@@ -84,11 +84,11 @@ class Page:
             self._playback.begin(self._playback.clip)
 
     def _obey(self) -> bool:
-        """Do what was asked for since the last time; whether there was anything."""
-        asked = not self._todo.empty()
+        """Do what visitors wanted since the last time; whether there was anything."""
+        busy = not self._todo.empty()
         while not self._todo.empty():
             self._todo.get()()
-        return asked
+        return busy
 
     # The scene
 

@@ -7,7 +7,7 @@ import numpy as np
 from forgetmimic_jax.robot.model import Robot
 from forgetmimic_jax.viewing.side_by_side import SideBySide, push, reference_qpos
 
-AFTER_END_SECONDS = 2.0  # lived on once every policy's episode has ended
+AFTER_END_SECONDS = 2.0  # simulated once every policy's episode has ended
 
 
 class Playback:
@@ -26,7 +26,7 @@ class Playback:
         self.horizon = int(self._state.horizon[0])
         self.step = 0
         self.qpos = np.asarray(self._state.physics.qpos)  # [policy, nq]
-        self.ended: list[int | None] = [None] * len(self._stage.names)  # steps lived before a bound was broken
+        self.ended: list[int | None] = [None] * len(self._stage.names)  # steps before a bound was broken
         self.tracking: list[np.ndarray] = []  # [step][policy] r̄, zero after the end
         self.height = [self._heights()]  # [step + 1][policy and reference] of the root, m
 

@@ -30,7 +30,7 @@ def test_every_part_of_an_iteration_is_timed(tiny, tmp_path, library_folder):
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("given", "message"),
     [
         ({"repeats": 0}, "--repeats: found 0; accepted: 1 or more"),
         ({"robot": "gg1"}, "robot 'gg1': no robots/gg1/gg1.yaml; did you mean 'g1'?"),
@@ -39,5 +39,5 @@ def test_every_part_of_an_iteration_is_timed(tiny, tmp_path, library_folder):
         ({"output": Path(__file__).parent}, f"{Path(__file__).parent}: a folder; --output is a file"),
     ],
 )
-def test_what_cannot_be_is_told_in_one_line(refused, given, told):
-    assert refused(bench.main, bench.Options(**given)) == told
+def test_what_cannot_be_is_told_in_one_line(refused, given, message):
+    assert refused(bench.main, bench.Options(**given)) == message

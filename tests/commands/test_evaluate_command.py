@@ -62,7 +62,7 @@ def test_a_base_that_was_replaced_since_is_told_unless_it_was_named(refused, unl
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("given", "message"),
     [
         ({"robot": "gg1", "checkpoint": None}, "robot 'gg1': no robots/gg1/gg1.yaml; did you mean 'g1'?"),
         ({"robot": "gg1"}, "robot 'gg1': no robots/gg1/gg1.yaml; did you mean 'g1'?"),
@@ -74,13 +74,13 @@ def test_a_base_that_was_replaced_since_is_told_unless_it_was_named(refused, unl
         ({"library": Path("nowhere")}, "nowhere/manifest.json: not found; a library is a folder with manifest.json"),
     ],
 )
-def test_what_cannot_be_is_told_in_one_line(refused, options, given, told):
-    assert refused(evaluate.main, options(**given)) == told
+def test_what_cannot_be_is_told_in_one_line(refused, options, given, message):
+    assert refused(evaluate.main, options(**given)) == message
 
 
 def test_a_run_in_place_of_a_checkpoint_is_told(refused, options, base_run):
-    told = refused(evaluate.main, options(checkpoint=base_run.folder))
-    assert told.endswith(
+    message = refused(evaluate.main, options(checkpoint=base_run.folder))
+    assert message.endswith(
         f"not a checkpoint: no meta.json; it is a run, whose newest checkpoint is {base_run.checkpoint(4)}"
     )
 
@@ -88,15 +88,15 @@ def test_a_run_in_place_of_a_checkpoint_is_told(refused, options, base_run):
 def test_an_output_that_cannot_be_is_told_before_the_rollouts(refused, options, tmp_path):
     (tmp_path / "file").write_text("mine")
     for output in (tmp_path / "file", tmp_path / "file" / "out"):
-        told = f"{output}: {tmp_path}/file is a file; choose another --output"
-        assert refused(evaluate.main, options(output=output)) == told
+        message = f"{output}: {tmp_path}/file is a file; choose another --output"
+        assert refused(evaluate.main, options(output=output)) == message
 
 
 def test_a_damaged_policy_is_told(refused, options, base_run, tmp_path):
     copy = Path(shutil.copytree(base_run.checkpoint(4), tmp_path / "copy"))
     (copy / "policy.safetensors").unlink()
-    told = f"{copy}/policy.safetensors: missing; the checkpoint cannot be used"
-    assert refused(evaluate.main, options(checkpoint=copy)) == told
+    message = f"{copy}/policy.safetensors: missing; the checkpoint cannot be used"
+    assert refused(evaluate.main, options(checkpoint=copy)) == message
 
 
 def test_mjx_is_accepted(base_run):

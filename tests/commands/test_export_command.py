@@ -26,8 +26,8 @@ def test_it_checks_writes_and_tells(unlearned_run, tmp_path):
     path = run / "checkpoints" / "00000002"
     default = finished(export.main, export.Options(checkpoint=path, output=None))
     file = run / "policy.onnx"
-    told = {entry.key: entry.value for entry in onnx.load(file).metadata_props}
-    assert told["run_path"] == f"g1/{policy_hash(read_info(path))}"
+    message = {entry.key: entry.value for entry in onnx.load(file).metadata_props}
+    assert message["run_path"] == f"g1/{policy_hash(read_info(path))}"
     assert not any(clip in file.read_bytes() for clip in (b"sway", b"turn", b"nod"))
     assert {each.name for each in run.iterdir()} - {each.name for each in unlearned_run.folder.iterdir()} == {
         "policy.onnx"
@@ -69,7 +69,7 @@ def test_an_onnx_with_other_actions_is_refused(options, monkeypatch, capfd, tmp_
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("given", "message"),
     [
         ({"robot": "gg1", "checkpoint": None}, "robot 'gg1': no robots/gg1/gg1.yaml; did you mean 'g1'?"),
         ({"checkpoint": Path("nowhere")}, "nowhere: no such checkpoint folder"),
@@ -80,5 +80,5 @@ def test_an_onnx_with_other_actions_is_refused(options, monkeypatch, capfd, tmp_
         ({"output": Path(__file__) / "x.onnx"}, f"{__file__}: {__file__} is a file; choose another --output"),
     ],
 )
-def test_what_cannot_be_is_told_in_one_line(refused, options, given, told):
-    assert refused(export.main, options(**given)) == told
+def test_what_cannot_be_is_told_in_one_line(refused, options, given, message):
+    assert refused(export.main, options(**given)) == message

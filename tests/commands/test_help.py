@@ -82,13 +82,13 @@ def test_help_waits_for_no_heavy_import():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
     [(["--robto", "g1"], "--robot"), (["--iterations", "many"], "many"), (["--physics", "bullet"], "mjx-warp")],
 )
-def test_a_wrong_flag_is_refused_with_what_is_accepted(arguments, told, capsys):
+def test_a_wrong_flag_is_refused_with_what_is_accepted(arguments, message, capsys):
     from forgetmimic_jax.train import Options
 
     with pytest.raises(SystemExit) as exit_:
         parse(Options, "train", arguments)
     assert exit_.value.code == 2
-    assert told in capsys.readouterr().err
+    assert message in capsys.readouterr().err

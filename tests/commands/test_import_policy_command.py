@@ -42,10 +42,10 @@ def test_the_checkpoint_acts_as_rsl_rl_did(imported_run):
 
 
 def test_how_long_to_retrain_it_has_to_be_said(imported_run):
-    asked = {"base": imported_run.folder, "targets": "turn", "method": "retrain"}
+    wanted = {"base": imported_run.folder, "targets": "turn", "method": "retrain"}
     with pytest.raises(InputError, match=r"--iterations: .* does not say how long it was trained"):
-        config_of_new_run(unlearn.Options(**asked))
-    assert config_of_new_run(unlearn.Options(**asked, iterations=3)).unlearn.method == "retrain"
+        config_of_new_run(unlearn.Options(**wanted))
+    assert config_of_new_run(unlearn.Options(**wanted, iterations=3)).unlearn.method == "retrain"
 
 
 def test_unlearning_starts_from_it(imported_run):
@@ -58,8 +58,8 @@ def test_unlearning_starts_from_it(imported_run):
 
 
 def test_it_tells_what_was_compared_and_assumed(imported_run):
-    told, where, following = imported_run.printed.strip().split("\n\n")
-    lines = told.splitlines()
+    message, where, following = imported_run.printed.strip().split("\n\n")
+    lines = message.splitlines()
     assert lines[0].startswith("Actions equal the original's to ")
     assert lines[-2].startswith("The critic starts fresh")
     assert lines[-1].startswith("A .pt does not name its observations and joints: ")
@@ -75,11 +75,11 @@ def test_what_was_exported_comes_back_as_it_went(base_run, library_folder, robot
     file, output = tmp_path / "policy.onnx", tmp_path / "back"
     there = load_policy(base_run.checkpoint(4))
     onnx.save(to_onnx(there, robot, checkpoint.read_info(base_run.checkpoint(4)).config, run_path=""), file)
-    told = finished(
+    message = finished(
         import_policy.main, import_policy.Options(policy=file, library=library_folder, std=0.7, output=output)
     )
-    assert "The file has no exploration noise; fine-tuning starts from a standard deviation of 0.7." in told.printed
-    assert "A .pt does not name" not in told.printed
+    assert "The file has no exploration noise; fine-tuning starts from a standard deviation of 0.7." in message.printed
+    assert "A .pt does not name" not in message.printed
     back = load_policy(output)
     assert_same(back.actor["params"]["MLP_0"], there.actor["params"]["MLP_0"])
     np.testing.assert_allclose(back.actor_normalizer.mean, there.actor_normalizer.mean, atol=1e-6)
@@ -95,7 +95,7 @@ def options(library_folder):
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("given", "message"),
     [
         ({"policy": Path("nowhere.pt")}, "nowhere.pt: no such file"),
         ({"policy": Path("nowhere.onnx")}, "nowhere.onnx: no such file"),
@@ -109,8 +109,8 @@ def options(library_folder):
         ({"output": RSL_RL.parent}, f"{RSL_RL.parent}: exists already; choose another --output, or remove it"),
     ],
 )
-def test_what_cannot_be_is_told_in_one_line(refused, options, given, told):
-    assert refused(import_policy.main, options(**given)) == told
+def test_what_cannot_be_is_told_in_one_line(refused, options, given, message):
+    assert refused(import_policy.main, options(**given)) == message
 
 
 def test_a_policy_that_comes_out_different_is_refused(refused, options, monkeypatch):
@@ -129,5 +129,5 @@ def test_observations_far_from_what_the_policy_knew_are_told(refused, options, t
     shifted = onnx.numpy_helper.to_array(mean) + 1e6
     mean.CopyFrom(onnx.numpy_helper.from_array(shifted.astype(np.float32), mean.name))
     onnx.save(model, tmp_path / "far.onnx")
-    told = refused(import_policy.main, options(policy=tmp_path / "far.onnx", activation=None))
-    assert told.endswith("standard deviations of its normaliser; is its observation layout another?")
+    message = refused(import_policy.main, options(policy=tmp_path / "far.onnx", activation=None))
+    assert message.endswith("standard deviations of its normaliser; is its observation layout another?")

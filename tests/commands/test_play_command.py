@@ -28,7 +28,7 @@ def test_base_and_unlearned_policy_are_served_from_the_first_target_on(unlearned
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("given", "message"),
     [
         ({"robot": "gg1", "checkpoint": None}, "robot 'gg1': no robots/gg1/gg1.yaml; did you mean 'g1'?"),
         ({"checkpoint": Path("nowhere")}, "nowhere: no such checkpoint folder"),
@@ -37,5 +37,5 @@ def test_base_and_unlearned_policy_are_served_from_the_first_target_on(unlearned
         ({"library": Path("nowhere")}, "nowhere/manifest.json: not found; a library is a folder with manifest.json"),
     ],
 )
-def test_what_cannot_be_is_told_in_one_line(refused, options, given, told):
-    assert refused(play.main, options(**given)) == told
+def test_what_cannot_be_is_told_in_one_line(refused, options, given, message):
+    assert refused(play.main, options(**given)) == message

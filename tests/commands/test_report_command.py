@@ -191,7 +191,7 @@ def test_without_a_training_log_there_are_no_curves(run, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("given", "message"),
     [
         ({"run": Path("nowhere")}, "nowhere: no such run folder"),
         ({"films": -1}, "--films: found -1; accepted: 0 or more"),
@@ -201,13 +201,13 @@ def test_without_a_training_log_there_are_no_curves(run, tmp_path):
         ({"relearning": Path("nowhere.json")}, "nowhere.json: not found"),
     ],
 )
-def test_what_cannot_be_is_told_in_one_line(refused, run, given, told):
-    assert refused(report.main, report.Options(**{"run": run, "output": Path("r.html"), "films": 0} | given)) == told
+def test_what_cannot_be_is_told_in_one_line(refused, run, given, message):
+    assert refused(report.main, report.Options(**{"run": run, "output": Path("r.html"), "films": 0} | given)) == message
 
 
 def test_what_is_no_unlearning_run_is_told(refused, base_run, run, tmp_path):
-    told = refused(report.main, report.Options(run=base_run.folder))
-    assert told.startswith(
+    message = refused(report.main, report.Options(run=base_run.folder))
+    assert message.startswith(
         f"{base_run.folder}/evaluation.json: not found; make it first, with: make evaluate CHECKPOINT"
     )
     copy = Path(shutil.copytree(run, tmp_path / "run"))
@@ -235,9 +235,9 @@ def test_an_unlearned_policy_that_was_replaced_since_is_told(refused, run, tmp_p
     document = json.loads((copy / "evaluation.json").read_text())
     document["policy_hashes"]["unlearned"] = "0123456789abcdef"
     (copy / "evaluation.json").write_text(json.dumps(document))
-    told = refused(report.main, report.Options(run=copy, films=0))
-    assert told.startswith(f"{copy}/checkpoints/00000002: found the policy ")
-    assert "is of the unlearned policy 0123456789abcdef" in told
+    message = refused(report.main, report.Options(run=copy, films=0))
+    assert message.startswith(f"{copy}/checkpoints/00000002: found the policy ")
+    assert "is of the unlearned policy 0123456789abcdef" in message
 
 
 def test_a_base_that_was_replaced_since_is_told(refused, run, base_run, tmp_path):

@@ -100,7 +100,7 @@ def study(run, document) -> dict:
         return {"settings": settings, "kept_skill": {"0": estimate(0.95), "1": estimate(0.9)}}
 
     return {
-        "asked": {"library": document["library_hash"], "targets": document["targets"]},
+        "conditions": {"library": document["library_hash"], "targets": document["targets"]},
         "results": {
             "base": {"0": 0.5, "1": 0.5},
             "starts": {
@@ -156,12 +156,12 @@ def refusal(refused, run: Path, folder: Path, *, control: Path | None = None, st
     options = report.Options(
         run=run, control=control, relearning=counts if study is not None else None, films=0, output=folder / "r.html"
     )
-    told = refused(report.main, options)
-    return told.removeprefix(f"{counts}: ").removeprefix(f"{control}/")
+    message = refused(report.main, options)
+    return message.removeprefix(f"{counts}: ").removeprefix(f"{control}/")
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("given", "message"),
     [
         (
             {"config": {"sampling.clips": "all"}},
@@ -196,13 +196,13 @@ def refusal(refused, run: Path, folder: Path, *, control: Path | None = None, st
         ({"policies": 3}, "evaluation.json: not an evaluation, or damaged: "),
     ],
 )
-def test_a_control_of_something_else_is_refused(refused, run, make_control, tmp_path, given, told):
-    assert refusal(refused, run, tmp_path, control=make_control(**given)).startswith(told)
+def test_a_control_of_something_else_is_refused(refused, run, make_control, tmp_path, given, message):
+    assert refusal(refused, run, tmp_path, control=make_control(**given)).startswith(message)
 
 
 def test_the_run_itself_is_no_control(refused, run, tmp_path):
-    told = "config.yaml: unlearn.method: found arft, no control; accepted: distill, retrain"
-    assert refusal(refused, run, tmp_path, control=run) == told
+    message = "config.yaml: unlearn.method: found arft, no control; accepted: distill, retrain"
+    assert refusal(refused, run, tmp_path, control=run) == message
 
 
 def test_a_control_that_does_not_say_its_base_is_not_measured(make_control, study, reported):
@@ -253,29 +253,37 @@ def test_a_run_that_was_evaluated_on_its_way_is_as_long_as_that(refused, run, st
     (copy / "checkpoints" / "00000001" / "meta.json").write_text(json.dumps(meta | {"iteration": 1}))
     text = (copy / "evaluation.json").read_text().replace("00000002", "00000001")
     (copy / "evaluation.json").write_text(text)
-    told = refusal(refused, copy, tmp_path, study=study)
-    assert told.startswith("results.origins.starts.unlearned.iterations: found 2; accepted: 1")
+    message = refusal(refused, copy, tmp_path, study=study)
+    assert message.startswith("results.origins.starts.unlearned.iterations: found 2; accepted: 1")
 
 
 def test_a_study_of_something_else_is_refused(refused, run, study, tmp_path):
-    def told(change: Callable[[dict], Any]) -> str:
+    def refused_when(change: Callable[[dict], Any]) -> str:
         copy = json.loads(json.dumps(study))
         change(copy)
         return refusal(refused, run, tmp_path, study=copy)
 
-    assert told(lambda of: of["asked"].update(library="x")).startswith("asked.library: found x; accepted: ")
-    assert told(lambda of: of["asked"].update(targets=["nod"])).startswith("asked.targets: found ['nod']; accepted: [")
-    assert told(lambda of: of["results"]["origins"].update(base="x")).startswith(
+    assert refused_when(lambda of: of["conditions"].update(library="x")).startswith(
+        "conditions.library: found x; accepted: "
+    )
+    assert refused_when(lambda of: of["conditions"].update(targets=["nod"])).startswith(
+        "conditions.targets: found ['nod']; accepted: ["
+    )
+    assert refused_when(lambda of: of["results"]["origins"].update(base="x")).startswith(
         "results.origins.base: found x; accepted: "
     )
-    assert told(lambda of: of["results"]["starts"].pop("unlearned")).startswith("not a relearning study, or damaged: ")
-    assert told(lambda of: of["results"]["origins"].update(starts=3)).startswith("not a relearning study, or damaged: ")
-    assert told(lambda of: of.clear()).startswith("not a relearning study, or damaged: KeyError: 'asked'")
+    assert refused_when(lambda of: of["results"]["starts"].pop("unlearned")).startswith(
+        "not a relearning study, or damaged: "
+    )
+    assert refused_when(lambda of: of["results"]["origins"].update(starts=3)).startswith(
+        "not a relearning study, or damaged: "
+    )
+    assert refused_when(lambda of: of.clear()).startswith("not a relearning study, or damaged: KeyError: 'conditions'")
 
-    def lived_all(of: dict) -> None:
+    def all_clips(of: dict) -> None:
         of["results"]["origins"]["starts"]["distilled"]["settings"]["sampling.clips"] = "all"
 
-    assert told(lived_all) == (
+    assert refused_when(all_clips) == (
         "results.origins.starts.distilled: sampling.clips: found all, so the control rolled out the targets; "
         "accepted: kept"
     )

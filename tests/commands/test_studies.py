@@ -61,8 +61,8 @@ def swept(base_run, tmp_path_factory) -> tuple[Path, str]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(trials, "POLL", 0.0)
         patch.setattr(trials, "_start", start)
-        asked = options(sweep.Options, base_run, folder, kind="seeds")
-        run = finished(sweep.main, asked)
+        wanted = options(sweep.Options, base_run, folder, kind="seeds")
+        run = finished(sweep.main, wanted)
     return folder, run.printed
 
 
@@ -114,8 +114,8 @@ def test_asked_the_same_again_it_runs_nothing(swept, base_run, monkeypatch):
 def test_other_seeds_find_the_finished_trials(swept, base_run, monkeypatch, tmp_path):
     folder, _ = swept
     monkeypatch.setattr(trials, "_start", None)
-    asked = options(sweep.Options, base_run, folder, kind="seeds", seeds=1, output=tmp_path)
-    finished(sweep.main, asked)
+    wanted = options(sweep.Options, base_run, folder, kind="seeds", seeds=1, output=tmp_path)
+    finished(sweep.main, wanted)
     document = json.loads((tmp_path / "seeds.json").read_text())
     assert document["results"]["variants"]["λ = 16"]["seeds"].keys() == {"0"}
 
@@ -126,9 +126,9 @@ def test_a_further_seed_runs_alone_where_the_numbers_of_the_others_are_stored(sw
     shutil.copy(folder / "out" / "seeds.json", tmp_path / "another_study.json")
     asked_for = []
 
-    def stand_in(asked, **_):
-        asked_for.extend(asked)
-        for trial in asked:
+    def stand_in(wanted, **_):
+        asked_for.extend(wanted)
+        for trial in wanted:
             shutil.copytree(folder / "trials" / stored["trials"]["0"], trial.folder)
         return {}
 
@@ -143,7 +143,7 @@ def test_a_further_seed_runs_alone_where_the_numbers_of_the_others_are_stored(sw
 
 def test_a_further_seed_that_fails_leaves_the_others_and_is_told(swept, base_run, monkeypatch, tmp_path):
     shutil.copy(swept[0] / "out" / "seeds.json", tmp_path)
-    monkeypatch.setattr(trials, "run_trials", lambda asked, **_: dict.fromkeys(asked, "no luck"))
+    monkeypatch.setattr(trials, "run_trials", lambda wanted, **_: dict.fromkeys(wanted, "no luck"))
     given = {"seeds": 3, "trials": tmp_path / "trials", "output": tmp_path}
     with pytest.raises(SystemExit) as exit_:
         sweep.main(options(sweep.Options, base_run, tmp_path, kind="seeds", **given))
@@ -181,25 +181,25 @@ def test_numbers_of_other_code_that_answer_the_question_stay_and_say_so(by_other
 
 def test_rows_of_other_code_are_not_added_to(by_other_code, base_run, refused, monkeypatch):
     monkeypatch.setattr(trials, "run_trials", None)
-    told = refused(sweep.main, options(sweep.Options, base_run, by_other_code, kind="seeds", seeds=3))
-    assert "seeds.json: made by code 0123abcd (commit fffffff), and this is code " in told
-    assert told.endswith("--mix-commits puts their runs into one table, another --output keeps them apart")
+    message = refused(sweep.main, options(sweep.Options, base_run, by_other_code, kind="seeds", seeds=3))
+    assert "seeds.json: made by code 0123abcd (commit fffffff), and this is code " in message
+    assert message.endswith("--mix-commits puts their runs into one table, another --output keeps them apart")
 
 
 def mixed(by_other_code: Path, base_run: Run, swept: Path, monkeypatch, **given) -> tuple[list[str], Path]:
     """The seeds that a sweep over three of them runs with --mix-commits, and where it wrote."""
     ran = []
 
-    def stand_in(asked, **_):
-        ran.extend(trial.flags[trial.flags.index("--seed") + 1] for trial in asked)
-        for trial in asked:
+    def stand_in(wanted, **_):
+        ran.extend(trial.flags[trial.flags.index("--seed") + 1] for trial in wanted)
+        for trial in wanted:
             shutil.copytree(next((swept / "trials").glob("*-s1-*/")), trial.folder)
         return {}
 
     monkeypatch.setattr(trials, "run_trials", stand_in)
-    asked = options(sweep.Options, base_run, by_other_code, kind="seeds", seeds=3, mix_commits=True, **given)
-    finished(sweep.main, asked)
-    return ran, asked.output
+    wanted = options(sweep.Options, base_run, by_other_code, kind="seeds", seeds=3, mix_commits=True, **given)
+    finished(sweep.main, wanted)
+    return ran, wanted.output
 
 
 @pytest.mark.parametrize("known", ["numbers", "folders"])
@@ -220,10 +220,10 @@ def test_rows_of_other_code_are_mixed_in_where_the_user_says_so(
 
 
 def test_trials_of_other_code_are_not_found(by_other_code, base_run, tmp_path, monkeypatch):
-    monkeypatch.setattr(trials, "run_trials", lambda asked, **_: dict.fromkeys(asked, f"{len(asked)} asked for"))
-    asked = options(sweep.Options, base_run, by_other_code, kind="seeds", output=tmp_path / "new")
-    with pytest.raises(InputError, match="2 asked for"):
-        sweep.main(asked)
+    monkeypatch.setattr(trials, "run_trials", lambda wanted, **_: dict.fromkeys(wanted, f"{len(wanted)} wanted for"))
+    wanted = options(sweep.Options, base_run, by_other_code, kind="seeds", output=tmp_path / "new")
+    with pytest.raises(InputError, match="2 wanted for"):
+        sweep.main(wanted)
 
 
 def test_the_files_can_be_drawn_from_the_numbers_alone(swept, tmp_path):
@@ -235,7 +235,7 @@ def test_the_files_can_be_drawn_from_the_numbers_alone(swept, tmp_path):
 
 
 def test_a_trial_that_fails_is_told_on_the_page_and_in_the_exit_code(swept, base_run, tmp_path, capsys, monkeypatch):
-    asked = options(sweep.Options, base_run, tmp_path, kind="seeds")
+    wanted = options(sweep.Options, base_run, tmp_path, kind="seeds")
     first, second = sorted((swept[0] / "trials").glob("*-s*/"))
     shutil.copytree(first, tmp_path / "trials" / first.name)
 
@@ -244,32 +244,32 @@ def test_a_trial_that_fails_is_told_on_the_page_and_in_the_exit_code(swept, base
         return document["failed"], " ".join(document["results"]["variants"]["λ = 16"]["seeds"])
 
     with monkeypatch.context() as patch:
-        patch.setattr(trials, "run_trials", lambda asked, **_: {trial: "no luck" for trial in asked})
+        patch.setattr(trials, "run_trials", lambda wanted, **_: {trial: "no luck" for trial in wanted})
         with pytest.raises(SystemExit) as exit_:
-            sweep.main(asked)
+            sweep.main(wanted)
     assert exit_.value.code == 1
     assert "1 trials failed; the same command tries them again" in capsys.readouterr().err
     assert results() == ({second.name: "no luck"}, "0")
     assert f"- Failed: `{second.name}`: no luck" in (tmp_path / "out" / "seeds.md").read_text()
     shutil.copytree(second, tmp_path / "trials" / second.name)
-    sweep.main(asked)  # tries what failed again
+    sweep.main(wanted)  # tries what failed again
     assert results() == ({}, "0 1")
 
 
 def test_what_is_finished_when_it_is_stopped_is_told(swept, base_run, tmp_path, monkeypatch):
-    asked = options(sweep.Options, base_run, tmp_path, kind="seeds")
+    wanted = options(sweep.Options, base_run, tmp_path, kind="seeds")
     name = next((swept[0] / "trials").glob("*-s0-*/")).name
 
     def stop(after):
-        def stand_in(asked, **_):
-            for trial in asked[:after]:
+        def stand_in(wanted, **_):
+            for trial in wanted[:after]:
                 shutil.copytree(swept[0] / "trials" / name, trial.folder)
             raise Interrupted("stopped")
 
         with monkeypatch.context() as patch:
             patch.setattr(trials, "run_trials", stand_in)
             with pytest.raises(Interrupted):
-                sweep.main(asked)
+                sweep.main(wanted)
 
     stop(after=0)
     assert not (tmp_path / "out").exists()
@@ -278,19 +278,19 @@ def test_what_is_finished_when_it_is_stopped_is_told(swept, base_run, tmp_path, 
     assert list(document["results"]["variants"]["λ = 16"]["seeds"]) == ["0"]
     assert list(document["failed"].values()) == ["stopped"]
     assert "`: stopped\n" in (tmp_path / "out" / "seeds.md").read_text()
-    stop(after=0)  # and asked again, it goes on with what is missing
+    stop(after=0)  # and wanted again, it goes on with what is missing
     document = json.loads((tmp_path / "out" / "seeds.json").read_text())
     assert list(document["results"]["variants"]["λ = 16"]["seeds"]) == ["0"]
 
 
 def test_where_every_trial_fails_nothing_is_written(refused, base_run, tmp_path, monkeypatch):
-    monkeypatch.setattr(trials, "run_trials", lambda asked, **_: dict.fromkeys(asked, "no luck"))
-    told = refused(sweep.main, options(sweep.Options, base_run, tmp_path, kind="seeds"))
-    assert told == "seeds: every trial failed; the first: no luck"
+    monkeypatch.setattr(trials, "run_trials", lambda wanted, **_: dict.fromkeys(wanted, "no luck"))
+    message = refused(sweep.main, options(sweep.Options, base_run, tmp_path, kind="seeds"))
+    assert message == "seeds: every trial failed; the first: no luck"
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("given", "message"),
     [
         ({"kind": "lambda", "values": ["four"]}, "--values: could not convert string to float: 'four'; accepted: "),
         ({"kind": "lambda", "values": ["0"]}, "--values: found 0; accepted: penalties above 0, such as 4 8 16"),
@@ -306,16 +306,16 @@ def test_where_every_trial_fails_nothing_is_written(refused, base_run, tmp_path,
         ({"kind": "seeds", "draw": True}, "seeds.json: not measured yet; leave --draw out"),
     ],
 )
-def test_what_cannot_be_is_told_in_one_line(refused, base_run, tmp_path, given, told):
-    assert told in refused(sweep.main, options(sweep.Options, base_run, tmp_path, **given))
+def test_what_cannot_be_is_told_in_one_line(refused, base_run, tmp_path, given, message):
+    assert message in refused(sweep.main, options(sweep.Options, base_run, tmp_path, **given))
 
 
 def test_a_damaged_file_of_numbers_is_told(refused, base_run, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "seeds.json").write_text("{")
-    told = refused(sweep.main, options(sweep.Options, base_run, tmp_path, kind="seeds"))
-    assert "seeds.json: damaged: " in told
-    assert told.endswith("; remove it to measure again")
+    message = refused(sweep.main, options(sweep.Options, base_run, tmp_path, kind="seeds"))
+    assert "seeds.json: damaged: " in message
+    assert message.endswith("; remove it to measure again")
 
 
 def test_help_lists_what_a_study_takes(capsys):
@@ -337,18 +337,18 @@ def test_help_lists_what_a_study_takes(capsys):
 def watched_run(base_run, tmp_path_factory) -> Run:
     """An unlearning run that was evaluated on its way, which stands for every trial of a study below."""
     output = tmp_path_factory.mktemp("runs") / "watched"
-    asked = unlearn.Options(
+    wanted = unlearn.Options(
         base=base_run.checkpoint(4), targets="turn", iterations=2, episodes=2, output=output, set=[["evaluate_every=1"]]
     )
-    return finished(unlearn.main, asked)
+    return finished(unlearn.main, wanted)
 
 
 @pytest.mark.parametrize("name", STUDIES)
 def test_every_study_comes_to_its_page_and_figure(name, base_run, watched_run, tmp_path, monkeypatch):
     asked_for = []
 
-    def stand_in(asked, **_):
-        for trial in dict.fromkeys(asked):
+    def stand_in(wanted, **_):
+        for trial in dict.fromkeys(wanted):
             asked_for.append(trial)
             parse(unlearn.Options, "unlearn", trial.flags)  # every flag is one of the command's
             if not trial.folder.exists():
@@ -375,8 +375,8 @@ def test_the_comparison_asks_for_every_method_and_every_sampler_with_and_without
 ):
     asked_for = {}
 
-    def stand_in(asked, **_):
-        for trial in asked:
+    def stand_in(wanted, **_):
+        for trial in wanted:
             given = parse(unlearn.Options, "unlearn", trial.flags)
             asked_for[given.method, given.penalty or 16.0, given.sampler, given.wrench, given.clips, given.seed] = given
             if not trial.folder.exists():

@@ -129,7 +129,7 @@ def test_settings_given_twice_add_up():
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("given", "message"),
     [
         ({"robot": "gg1"}, "robot 'gg1': no robots/gg1/gg1.yaml; did you mean 'g1'?"),
         ({"library": Path("nowhere")}, "nowhere/manifest.json: not found; a library is a folder with manifest.json"),
@@ -162,8 +162,8 @@ def test_settings_given_twice_add_up():
         ({"set": [[*TINY, "checkpoint_every=0"]]}, "--set: checkpoint_every: found 0; accepted: a whole number from 1"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_is_told_in_one_line(refused, options, given, told):
-    assert refused(train.main, options(**given)) == told
+def test_what_cannot_be_is_told_in_one_line(refused, options, given, message):
+    assert refused(train.main, options(**given)) == message
 
 
 def damage(library: Path, how: str) -> None:
@@ -185,7 +185,7 @@ def damage(library: Path, how: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("how", "told"),
+    ("how", "message"),
     [
         ("empty", "library/manifest.json: clips: the library is empty; import or retarget a clip first"),
         ("another robot's", "library/manifest.json: robot: found 'h2'; 'g1' is needed"),
@@ -195,27 +195,27 @@ def damage(library: Path, how: str) -> None:
         ("a clip was changed", "library/turn.npz: sha256 "),
     ],
 )
-def test_a_damaged_library_is_told_in_one_line(refused, options, tmp_path, library_folder, how, told):
+def test_a_damaged_library_is_told_in_one_line(refused, options, tmp_path, library_folder, how, message):
     library = Path(shutil.copytree(library_folder, tmp_path / "library"))
     damage(library, how)
-    assert refused(train.main, options(library=library)).startswith(f"{tmp_path}/{told}")
+    assert refused(train.main, options(library=library)).startswith(f"{tmp_path}/{message}")
 
 
 def test_a_folder_that_cannot_be_the_run_s_is_told(refused, options, tmp_path, base_run):
     (tmp_path / "file").write_text("mine")
-    told = f"{tmp_path}/file is a file; choose another --output"
-    assert refused(train.main, options(output=tmp_path / "file")) == f"{tmp_path}/file: {told}"
-    assert refused(train.main, options(output=tmp_path / "file" / "run")) == f"{tmp_path}/file/run: {told}"
-    told = f"{base_run.folder}: exists already; choose another --output, or continue with --resume"
-    assert refused(train.main, options(output=base_run.folder)) == told
+    message = f"{tmp_path}/file is a file; choose another --output"
+    assert refused(train.main, options(output=tmp_path / "file")) == f"{tmp_path}/file: {message}"
+    assert refused(train.main, options(output=tmp_path / "file" / "run")) == f"{tmp_path}/file/run: {message}"
+    message = f"{base_run.folder}: exists already; choose another --output, or continue with --resume"
+    assert refused(train.main, options(output=base_run.folder)) == message
 
 
 def test_flags_that_contradict_the_run_to_resume_are_told(refused, base_run):
     def resume(**flags):
         return refused(train.main, train.Options(output=base_run.folder, resume=True, **flags))
 
-    told = "but the run to resume has 0; leave the flag out"
-    assert resume(seed=1) == f"--seed: found 1, {told}"
+    message = "but the run to resume has 0; leave the flag out"
+    assert resume(seed=1) == f"--seed: found 1, {message}"
     assert resume(preset="paper").startswith("--preset: found paper, but the run to resume has cpu")
     assert resume(set=[["ppo.num_envs=16"]]) == (
         f"{base_run.checkpoint(4)}: ppo.num_envs: the checkpoint's is 8, this run's 16"
@@ -223,14 +223,14 @@ def test_flags_that_contradict_the_run_to_resume_are_told(refused, base_run):
 
 
 def test_a_base_of_another_network_is_told(refused, options, base_run):
-    told = refused(train.main, options(base=base_run.checkpoint(4), set=[[*TINY, "ppo.actor_layers=[8,8]"]]))
-    assert told == f"{base_run.checkpoint(4)}: ppo.actor_layers: the checkpoint's is [16], this run's [8, 8]"
+    message = refused(train.main, options(base=base_run.checkpoint(4), set=[[*TINY, "ppo.actor_layers=[8,8]"]]))
+    assert message == f"{base_run.checkpoint(4)}: ppo.actor_layers: the checkpoint's is [16], this run's [8, 8]"
 
 
 def test_damaged_settings_of_the_run_to_resume_are_told(refused, base_run, tmp_path):
     run = Path(shutil.copytree(base_run.folder, tmp_path / "run"))
     settings = (run / "config.yaml").read_text()
-    for content, told in (
+    for content, message in (
         (settings.replace("seed:", "sead:"), "no setting 'sead'; did you mean 'seed'?"),
         (
             settings.replace("seed: 0", "seed: zero"),
@@ -240,4 +240,4 @@ def test_damaged_settings_of_the_run_to_resume_are_told(refused, base_run, tmp_p
         ("", "found None; accepted: a table of settings"),
     ):
         (run / "config.yaml").write_text(content)
-        assert refused(train.main, train.Options(output=run, resume=True)).startswith(f"{run}/config.yaml: {told}")
+        assert refused(train.main, train.Options(output=run, resume=True)).startswith(f"{run}/config.yaml: {message}")

@@ -55,7 +55,7 @@ def test_its_settings_are_the_base_s_but_for_what_unlearning_changes(base_run, u
     assert (found.unlearn.targets, found.unlearn.settings) == (
         ("turn",),
         {"penalty": 16.0},
-    )  # it was asked for " turn, turn ,"
+    )  # it was wanted for " turn, turn ,"
     assert found == dataclasses.replace(
         base,
         base=str(base_run.checkpoint(4)),
@@ -185,7 +185,7 @@ def test_a_preset_brings_its_settings_but_keeps_the_base_s_network(options, base
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("given", "message"),
     [
         ({"targets": "trun"}, "targets: no clip 'trun' in the library; did you mean 'turn'?"),
         ({"targets": "turn,punch"}, "targets: no clip 'punch' in the library; known: sway, turn, nod"),
@@ -217,14 +217,14 @@ def test_a_preset_brings_its_settings_but_keeps_the_base_s_network(options, base
         ),
     ],
 )
-def test_what_cannot_be_is_told_in_one_line(refused, options, given, told):
-    assert refused(unlearn.main, options(**given)) == told
+def test_what_cannot_be_is_told_in_one_line(refused, options, given, message):
+    assert refused(unlearn.main, options(**given)) == message
 
 
 def test_no_shipped_base_is_told(refused, options, tmp_path, monkeypatch):
     monkeypatch.setattr(start, "DATA_DIR", tmp_path)
-    told = f"{tmp_path}/g1/base: no policy is shipped for 'g1'; train one and name its checkpoint"
-    assert refused(unlearn.main, options(base=None)) == told
+    message = f"{tmp_path}/g1/base: no policy is shipped for 'g1'; train one and name its checkpoint"
+    assert refused(unlearn.main, options(base=None)) == message
 
 
 @pytest.fixture
@@ -237,13 +237,13 @@ def test_a_base_of_another_robot_is_told(refused, options, damaged):
     note = json.loads((damaged / "meta.json").read_text())
     (damaged / "meta.json").write_text(json.dumps(note | {"robot": "h2", "joints": note["joints"][:3]}))
     joints = len(note["joints"])
-    told = f"{damaged}: robot: the checkpoint's is 'h2' (3 joints), this run's 'g1' ({joints} joints)"
-    assert refused(unlearn.main, options(base=damaged)) == told
+    message = f"{damaged}: robot: the checkpoint's is 'h2' (3 joints), this run's 'g1' ({joints} joints)"
+    assert refused(unlearn.main, options(base=damaged)) == message
 
 
 def test_a_base_of_another_network_is_told(refused, options, damaged):
-    told = refused(unlearn.main, options(base=damaged, set=[["ppo.critic_layers=[8]"]]))
-    assert told == f"{damaged}: ppo.critic_layers: the checkpoint's is [16], this run's [8]"
+    message = refused(unlearn.main, options(base=damaged, set=[["ppo.critic_layers=[8]"]]))
+    assert message == f"{damaged}: ppo.critic_layers: the checkpoint's is [16], this run's [8]"
 
 
 def test_a_base_of_another_library_is_told(refused, options, damaged, tmp_path, library_folder):
@@ -251,9 +251,9 @@ def test_a_base_of_another_library_is_told(refused, options, damaged, tmp_path, 
     manifest = json.loads((library / "manifest.json").read_text())
     del manifest["clips"]["nod"]
     (library / "manifest.json").write_text(json.dumps(manifest))
-    told = refused(unlearn.main, options(base=damaged, library=library))
-    assert told.startswith(f"{damaged}: library: the checkpoint's hash is ")
-    assert told.endswith("(missing here: nod)")
+    message = refused(unlearn.main, options(base=damaged, library=library))
+    assert message.startswith(f"{damaged}: library: the checkpoint's hash is ")
+    assert message.endswith("(missing here: nod)")
 
 
 def test_a_damaged_base_is_told(refused, options, damaged):
@@ -269,17 +269,17 @@ def test_a_damaged_base_is_told(refused, options, damaged):
 def test_a_damaged_checkpoint_to_resume_is_told(refused, unlearned_run, tmp_path):
     run = Path(shutil.copytree(unlearned_run.folder, tmp_path / "run"))
     shutil.rmtree(run / "checkpoints" / "00000002" / "run" / "d")
-    told = refused(unlearn.main, unlearn.Options(output=run, resume=True))
-    assert told.startswith(f"{run}/checkpoints/00000002/run/d/")
-    assert told.endswith(": missing; the checkpoint cannot be used")
+    message = refused(unlearn.main, unlearn.Options(output=run, resume=True))
+    assert message.startswith(f"{run}/checkpoints/00000002/run/d/")
+    assert message.endswith(": missing; the checkpoint cannot be used")
 
 
 def test_a_base_that_is_gone_is_told_before_the_run_goes_on(refused, unlearned_run, tmp_path):
     run = Path(shutil.copytree(unlearned_run.folder, tmp_path / "run"))
     config = (run / "config.yaml").read_text().splitlines()
     (run / "config.yaml").write_text("\n".join("base: gone" if "base: " in line else line for line in config))
-    told = refused(unlearn.main, unlearn.Options(output=run, resume=True, iterations=3))
-    assert told == "gone: no such checkpoint folder"
+    message = refused(unlearn.main, unlearn.Options(output=run, resume=True, iterations=3))
+    assert message == "gone: no such checkpoint folder"
 
 
 def test_flags_that_contradict_the_run_to_resume_are_told(refused, unlearned_run):
@@ -402,8 +402,8 @@ def test_an_unknown_method_is_told(refused, options):
 
 
 def test_a_method_that_contradicts_the_run_to_resume_is_told(refused, unlearned_run):
-    told = refused(unlearn.main, unlearn.Options(output=unlearned_run.folder, resume=True, method="retrain"))
-    assert told == "--method: found retrain, but the run to resume has arft; leave the flag out"
+    message = refused(unlearn.main, unlearn.Options(output=unlearned_run.folder, resume=True, method="retrain"))
+    assert message == "--method: found retrain, but the run to resume has arft; leave the flag out"
 
 
 def test_another_robot_learns_from_the_first_forgets_and_is_evaluated_on_its_own_library(base_run, tmp_path):
@@ -411,8 +411,8 @@ def test_another_robot_learns_from_the_first_forgets_and_is_evaluated_on_its_own
     start = base_run.checkpoint(4)
     given = train.Options(robot="h2", base=start, output=tmp_path / "base", iterations=2, set=[TINY])
     base = finished(train.main, given)
-    asked = {"robot": "h2", "base": base.checkpoint(2), "iterations": 1, "episodes": 1}
-    run = finished(unlearn.main, unlearn.Options(**asked, output=tmp_path / "unlearned"))
+    wanted = {"robot": "h2", "base": base.checkpoint(2), "iterations": 1, "episodes": 1}
+    run = finished(unlearn.main, unlearn.Options(**wanted, output=tmp_path / "unlearned"))
     document = json.loads((run.folder / "evaluation.json").read_text())
     assert document["robot"] == "h2"
     assert document["targets"] == ["punch", "kick"]

@@ -49,7 +49,7 @@ def test_base_and_unlearned_policy_are_filmed_side_by_side(unlearned_run, tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("given", "message"),
     [
         ({"robot": "gg1", "checkpoint": None}, "robot 'gg1': no robots/gg1/gg1.yaml; did you mean 'g1'?"),
         ({"checkpoint": Path("nowhere")}, "nowhere: no such checkpoint folder"),
@@ -62,8 +62,8 @@ def test_base_and_unlearned_policy_are_filmed_side_by_side(unlearned_run, tmp_pa
         ({"output": Path(__file__)}, f"{__file__}: {__file__} is a file; choose another --output"),
     ],
 )
-def test_what_cannot_be_is_told_in_one_line(refused, options, given, told):
-    assert refused(video.main, options(**given)) == told
+def test_what_cannot_be_is_told_in_one_line(refused, options, given, message):
+    assert refused(video.main, options(**given)) == message
 
 
 def test_where_nothing_can_be_drawn_it_is_told_before_anything_is_written(refused, options, monkeypatch):

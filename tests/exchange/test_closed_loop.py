@@ -55,9 +55,9 @@ def test_every_step_to_the_horizon_is_recorded(record):
 
 
 def test_progress_is_told_after_each_episode(evaluator, gentle, robot, library, tiny_config):
-    told = []
+    message = []
     actor = OnnxActor(to_onnx(gentle, robot, tiny_config, run_path="").SerializeToString())
     start = evaluator.start()
     short = dataclasses.replace(start, horizon=np.full(4, 3))
-    run_episodes(actor, robot, library, evaluator.config, short, report=lambda *done: told.append(done))
-    assert told == [(1, 3), (2, 6), (3, 9), (4, 12)]
+    run_episodes(actor, robot, library, evaluator.config, short, report=lambda *done: message.append(done))
+    assert message == [(1, 3), (2, 6), (3, 9), (4, 12)]

@@ -76,7 +76,7 @@ def test_a_user_is_told_what_was_missing():
 
 
 @pytest.mark.parametrize(
-    ("actor", "told"),
+    ("actor", "message"),
     [
         (
             ImportedActor(((array(160, 8), array(8)), (array(8, 29), array(29)))),
@@ -106,10 +106,10 @@ def test_a_user_is_told_what_was_missing():
         ),
     ],
 )
-def test_what_does_not_fit_is_told(robot, tmp_path, actor, told):
+def test_what_does_not_fit_is_told(robot, tmp_path, actor, message):
     with pytest.raises(InputError) as error:
         check_actor(actor, LAYOUTS["wbc132"], robot, tmp_path)
-    assert str(error.value).startswith(f"{tmp_path}: {told}")
+    assert str(error.value).startswith(f"{tmp_path}: {message}")
 
 
 def test_the_needed_observation_is_told_term_by_term(robot, tmp_path):

@@ -49,15 +49,15 @@ def test_the_metadata_is_mjlabs(actor, robot):
         *("policy_only_export", "action_mode"),  # wbc-mjlab's
         "step_dt",
     }
-    told = actor.metadata
-    assert told["joint_names"].split(",") == list(robot.joint_names)
-    assert told["body_names"].split(",")[0] == "pelvis"
-    assert (told["anchor_body_name"], told["command_names"]) == ("torso_link", "motion")
-    assert told["observation_names"] == (
+    message = actor.metadata
+    assert message["joint_names"].split(",") == list(robot.joint_names)
+    assert message["body_names"].split(",")[0] == "pelvis"
+    assert (message["anchor_body_name"], message["command_names"]) == ("torso_link", "motion")
+    assert message["observation_names"] == (
         "ref_base_height,ref_base_lin_vel_b,ref_base_ang_vel_b,ref_gravity_b,ref_joint_pos,"
         "base_ang_vel,projected_gravity,joint_pos,joint_vel,actions"
     )
-    assert told["action_mode"] == "reference_residual"
+    assert message["action_mode"] == "reference_residual"
 
 
 def test_gains_and_scales_read_back_to_the_last_digit(actor, robot):

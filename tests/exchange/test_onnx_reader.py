@@ -101,7 +101,7 @@ START = helper.make_node("Identity", ["obs"], ["x"])
 
 
 @pytest.mark.parametrize(
-    ("nodes", "told"),
+    ("nodes", "message"),
     [
         ([START, *FIRST, helper.make_node("Relu", ["d0"], ["e0"]), LAST[1]], "operation Relu: accepted, in this "),
         ([START, *FIRST, helper.make_node("Elu", ["d0"], ["e0"], alpha=0.5), LAST[1]], "operation Elu: accepted, "),
@@ -115,11 +115,11 @@ START = helper.make_node("Identity", ["obs"], ["x"])
         ([helper.make_node("Identity", ["five"], ["actions"])], "operation Identity: found no value as input; "),
     ],
 )
-def test_another_network_is_told(robot, save, nodes, told, tiny_config):
+def test_another_network_is_told(robot, save, nodes, message, tiny_config):
     path = save(network(robot, *nodes, five=[5.0], **KERNELS))
     with pytest.raises(InputError) as error:
         read_onnx(path, robot, tiny_config)
-    assert str(error.value).removeprefix(f"{path}: ").startswith(told)
+    assert str(error.value).removeprefix(f"{path}: ").startswith(message)
 
 
 def test_other_inputs_or_outputs_are_told(robot, save, exported, tiny_config):
@@ -133,7 +133,7 @@ def test_other_inputs_or_outputs_are_told(robot, save, exported, tiny_config):
 
 
 @pytest.mark.parametrize(
-    ("key", "change", "told"),
+    ("key", "change", "message"),
     [
         (
             "joint_names",
@@ -168,14 +168,14 @@ def test_other_inputs_or_outputs_are_told(robot, save, exported, tiny_config):
         ),
     ],
 )
-def test_metadata_of_another_robot_or_observation_is_told(robot, save, exported, key, change, told, tiny_config):
+def test_metadata_of_another_robot_or_observation_is_told(robot, save, exported, key, change, message, tiny_config):
     for entry in exported.metadata_props:
         if entry.key == key:
             entry.value = change(entry.value)
     path = save(exported)
     with pytest.raises(InputError) as error:
         read_onnx(path, robot, tiny_config)
-    assert str(error.value).startswith(f"{path}: {key}: {told}")
+    assert str(error.value).startswith(f"{path}: {key}: {message}")
 
 
 def test_metadata_with_mjlabs_three_decimals_or_none_is_accepted(robot, save, exported, tiny_config):

@@ -63,14 +63,14 @@ def test_settings_run_nothing(copy):
 
 
 @pytest.mark.parametrize(
-    ("activation", "told"),
+    ("activation", "message"),
     [
         (None, r"activation: a checkpoint does not say it, .* give --activation elu if the hidden layers' is$"),
         ("tanh", r"activation: found 'tanh'; accepted: elu$"),
     ],
 )
-def test_an_activation_that_is_unknown_or_another_is_told(copy, activation, told):
-    with pytest.raises(InputError, match=told):
+def test_an_activation_that_is_unknown_or_another_is_told(copy, activation, message):
+    with pytest.raises(InputError, match=message):
         read_rsl_rl(copy, activation)
 
 
@@ -132,21 +132,21 @@ def test_a_tensor_beyond_its_storage_is_told(tmp_path, shown):
 
 
 def test_what_is_no_such_checkpoint_is_told(tmp_path):
-    def told(path: Path) -> str:
+    def message(path: Path) -> str:
         with pytest.raises(InputError) as error:
             read_rsl_rl(path, "elu")
         return str(error.value).removeprefix(f"{path}: ")
 
-    assert told(tmp_path / "nowhere.pt") == "no such file"
+    assert message(tmp_path / "nowhere.pt") == "no such file"
     old = tmp_path / "old.pt"
     old.write_bytes(b"\x80\x02\x8a\nl\xfc\x9cF")
-    assert told(old) == "not a file of torch.save (torch 1.6 or later)"
-    assert told(saved(tmp_path / "list.pt", [1])) == "found a list; accepted: the dict that rsl_rl saves"
-    assert told(saved(tmp_path / "other.pt", {"iter": 3})).startswith("found iter; accepted: actor_state_dict or ")
-    assert told(saved(tmp_path / "half.pt", pickle.dumps({"iter": 3})[:-3])).startswith("damaged: ")
+    assert message(old) == "not a file of torch.save (torch 1.6 or later)"
+    assert message(saved(tmp_path / "list.pt", [1])) == "found a list; accepted: the dict that rsl_rl saves"
+    assert message(saved(tmp_path / "other.pt", {"iter": 3})).startswith("found iter; accepted: actor_state_dict or ")
+    assert message(saved(tmp_path / "half.pt", pickle.dumps({"iter": 3})[:-3])).startswith("damaged: ")
     recurrent = {"model_state_dict": {"memory_a.rnn.weight_ih_l0": np.zeros((4, 4))}}
-    assert told(saved(tmp_path / "r.pt", recurrent)).startswith("found memory_a.rnn.weight_ih_l0; accepted: an MLP")
-    assert told(saved(tmp_path / "none.pt", {"actor_state_dict": {}})).startswith("no mlp.0.weight in it; ")
+    assert message(saved(tmp_path / "r.pt", recurrent)).startswith("found memory_a.rnn.weight_ih_l0; accepted: an MLP")
+    assert message(saved(tmp_path / "none.pt", {"actor_state_dict": {}})).startswith("no mlp.0.weight in it; ")
     normed = {"mlp.0.weight": np.zeros((8, 132)), "mlp.0.bias": np.zeros(8), "mlp.1.weight": np.zeros(8)}
-    told_of_norm = told(saved(tmp_path / "norm.pt", {"actor_state_dict": normed}))
+    told_of_norm = message(saved(tmp_path / "norm.pt", {"actor_state_dict": normed}))
     assert told_of_norm.startswith("mlp.1.weight: found shape [8] as module 1; accepted: linear layers with an ")

@@ -236,7 +236,7 @@ def test_half_of_the_skill_is_gone_between_two_penalties_before_the_first_or_aft
 def test_wear_is_what_the_kept_clips_lose_of_their_start():
     def found(end: list[float]):
         groups = [{"kept": {"survival_weighted_tracking": over_seeds(of)}} for of in ([0.8, 0.8, 0.8], [0.1] * 3, end)]
-        (one,) = heat_map.findings({"asked": {"iterations": 1000}, "results": {"groups": groups}})
+        (one,) = heat_map.findings({"conditions": {"iterations": 1000}, "results": {"groups": groups}})
         return one
 
     assert found([0.78, 0.79, 0.80]).word == "holds"
@@ -250,7 +250,7 @@ def test_any_motion_is_forgotten_and_the_others_stay():
         "run": variant([0.0, 0.0, 0.0], [0.4, 0.41, 0.42], skill=[0.1, 0.12, 0.11]),
         "dance": variant([0.0, 0.0, 0.0], [0.6, 0.6, 0.6], skill=[0.5, 0.52, 0.51]),
     }
-    found = targets.findings({"asked": {"robot": "g1"}, "results": {"variants": runs}})
+    found = targets.findings({"conditions": {"robot": "g1"}, "results": {"variants": runs}})
     assert words(found) == {
         "run: forgotten on the G1": "holds",
         "run: the kept clips stay as they were": "does not hold",
@@ -271,8 +271,8 @@ def test_any_motion_is_forgotten_and_the_others_stay():
 )
 def test_membership_shows_in_the_auc_on_either_side_and_in_the_hits(auc, hits, expected):
     of = {"auc": over_seeds(auc), "tpr_at_5_percent_fpr": over_seeds(hits)}
-    asked = {"targets": ["punch", "kick"], "episodes": 20}
-    found = list(membership.findings({"asked": asked, "results": {"policies": {"λ = 16": of}}}))
+    wanted = {"targets": ["punch", "kick"], "episodes": 20}
+    found = list(membership.findings({"conditions": wanted, "results": {"policies": {"λ = 16": of}}}))
     assert [one.word for one in found] == expected
     assert [one.main for one in found] == [True, False]
     assert found[1].evidence.endswith("guessing 0.07")  # of 41 alike, one is among the first three in 3 of 41 cases

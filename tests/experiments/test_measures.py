@@ -27,10 +27,10 @@ class StandIn(Lab):
         self.base, self.targets, self.seeds = root / "base", (TARGET,), (0, 1)
         self.config = Config()
         self.info = SimpleNamespace(clips=(KEPT, TARGET), environment_steps=7 * 4096 * 24)
-        self.root, self.asked = root, []
+        self.root, self.wanted = root, []
 
     def run(self, variants, what):
-        self.asked.append(dict(variants))
+        self.wanted.append(dict(variants))
         folders = {(label, seed): self.root / f"{label}-{seed}" for label, seed in variants}
         for folder in folders.values():
             (folder / "checkpoints" / "00000004").mkdir(parents=True, exist_ok=True)
@@ -101,11 +101,11 @@ def test_membership_learns_from_the_kept_clips_and_is_asked_about_the_targets(tm
         assert found[label]["auc"]["mean"] == pytest.approx(auc), label
         assert found[label]["tpr_at_5_percent_fpr"]["mean"] == pytest.approx(tpr), label
         assert found[label]["auc"]["n"] == policies
-    (asked,) = lab.asked
-    assert asked["λ = 16", 1] == {"seed": 1}
-    assert asked["fine-tuned, all clips", 0] == {"method": "finetune", "clips": "all", "seed": 0}
-    assert asked["distilled", 1] == {"method": "distill", "seed": 1}
-    assert asked["retrained", 0] == {"method": "retrain", "iterations": 7, "seed": 0}
+    (wanted,) = lab.wanted
+    assert wanted["λ = 16", 1] == {"seed": 1}
+    assert wanted["fine-tuned, all clips", 0] == {"method": "finetune", "clips": "all", "seed": 0}
+    assert wanted["distilled", 1] == {"method": "distill", "seed": 1}
+    assert wanted["retrained", 0] == {"method": "retrain", "iterations": 7, "seed": 0}
 
 
 AT_START = {
@@ -168,7 +168,7 @@ def test_relearning_starts_from_each_policy_and_its_levels_are_the_bases(tmp_pat
 def test_whatever_the_start_relearning_is_on_all_clips_half_on_targets_and_free_of_any_base(tmp_path):
     lab = Relearned(tmp_path)
     relearning.measure(lab)
-    policies, relearned = lab.asked
+    policies, relearned = lab.wanted
     assert policies["unlearned", 1] == {"iterations": 200, "seed": 1}
     assert policies["distilled", 0] == {"iterations": 200, "method": "distill", "seed": 0}
     assert policies["retrained", 0] == {"method": "retrain", "iterations": 7, "seed": 0}
@@ -240,7 +240,7 @@ def test_the_heat_map_has_the_base_first_and_then_every_evaluation_of_each_seed(
     assert [at[TARGET][TRACKING]["mean"] for at in found["checkpoints"]] == pytest.approx([0.85, 0.4, 0.4])
     assert [at["target"][TRACKING]["mean"] for at in found["groups"]] == pytest.approx([0.85, 0.4, 0.4])
     assert [at["kept"]["tracking_reward"]["mean"] for at in found["groups"]] == pytest.approx([0.8, 0.7, 0.7])
-    assert lab.asked == [
+    assert lab.wanted == [
         {("λ = 16", s): {"seed": s, "set": ["evaluate_every=2", "evaluate_episodes=2"]} for s in (0, 1)}
     ]
 
@@ -259,6 +259,6 @@ def test_training_curves_are_over_the_rows_that_every_seed_has(tmp_path):
     assert of["iterations"] == [1, 10, 20]
     assert [row["entropy"]["mean"] for row in of["rows"]] == [1.5, 10.5, 20.5]
     assert [row.get("target/lambda_crit", {}).get("mean") for row in of["rows"]] == [9.0, None, 7.5]
-    (asked,) = lab.asked
-    assert asked[training_dynamics.A, 1] == {"penalty": 2.0, "sampler": "adaptive", "wrench": True, "seed": 1}
-    assert asked[training_dynamics.B, 0] == {"penalty": 8.0, "seed": 0}
+    (wanted,) = lab.wanted
+    assert wanted[training_dynamics.A, 1] == {"penalty": 2.0, "sampler": "adaptive", "wrench": True, "seed": 1}
+    assert wanted[training_dynamics.B, 0] == {"penalty": 8.0, "seed": 0}

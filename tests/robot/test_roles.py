@@ -1,4 +1,4 @@
-"""The YAML of roles: every fault of it is told, and left and right follow from the pairs."""
+"""The YAML of roles: every fault of it is found_message, and left and right follow from the pairs."""
 
 import pytest
 import yaml

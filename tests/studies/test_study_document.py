@@ -21,7 +21,14 @@ OTHER = {**HERE, "code": "0123abcd", "commit": "f" * 40}
 
 
 def document(groups: list[dict], variants: dict | None = None) -> dict:
-    return {"schema": 2, "study": "s", "asked": {}, "made_by": groups, "failed": {}, "results": {"variants": variants}}
+    return {
+        "schema": 2,
+        "study": "s",
+        "conditions": {},
+        "made_by": groups,
+        "failed": {},
+        "results": {"variants": variants},
+    }
 
 
 def test_a_document_comes_back_with_nine_digits_and_a_line_for_each_innermost_table(tmp_path):
@@ -32,7 +39,7 @@ def test_a_document_comes_back_with_nine_digits_and_a_line_for_each_innermost_ta
     assert found == {"seeds": {"0": {"x": 0.333333333, "y": [2.0, 142857.143]}}}
     assert json.loads(path.read_text()) == read_document(path)
     lines = [line.strip() for line in path.read_text().splitlines()]
-    assert '"asked": {},' in lines
+    assert '"conditions": {},' in lines
     assert '"y": [2.0, 142857.143]' in lines
     assert read_document(tmp_path / "gone.json") is None
 

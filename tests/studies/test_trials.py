@@ -70,19 +70,19 @@ def journal(tmp_path: Path) -> list[str]:
 
 
 def test_a_trial_that_fails_is_told_and_stops_no_other(tmp_path, capsys):
-    asked = [trial(tmp_path, seed) for seed in (0, 1, 2)]
-    assert run_trials(asked, jobs=1, description="try") == {asked[1]: "no luck"}
-    assert [one.evaluation.is_file() for one in asked] == [True, False, True]
+    wanted = [trial(tmp_path, seed) for seed in (0, 1, 2)]
+    assert run_trials(wanted, jobs=1, description="try") == {wanted[1]: "no luck"}
+    assert [one.evaluation.is_file() for one in wanted] == [True, False, True]
     printed = capsys.readouterr().out
-    assert f"failed: s1: no luck ({asked[1].log})" in printed
+    assert f"failed: s1: no luck ({wanted[1].log})" in printed
     assert "finished: s2" in printed
-    assert asked[1].log.read_text() == "some words\nerror: no luck\n"
+    assert wanted[1].log.read_text() == "some words\nerror: no luck\n"
 
 
 def test_what_is_finished_is_not_run_again_and_what_failed_is(tmp_path):
-    asked = [trial(tmp_path, seed) for seed in (0, 1)]
+    wanted = [trial(tmp_path, seed) for seed in (0, 1)]
     for _ in range(2):
-        run_trials(asked, jobs=1, description="try")
+        run_trials(wanted, jobs=1, description="try")
     assert journal(tmp_path) == ["start 0", "end 0", "start 1", "start 1"]
 
 
@@ -102,12 +102,12 @@ def test_the_same_trial_asked_for_twice_runs_once(tmp_path):
 
 
 def test_a_stop_lets_the_running_trial_save_and_the_next_time_it_is_resumed(tmp_path):
-    asked = trial(tmp_path, 9)
+    wanted = trial(tmp_path, 9)
 
     def stop_at(line: str) -> None:
         while not (tmp_path / "trials" / "journal").is_file() or line not in journal(tmp_path):
             time.sleep(0.02)
-        while not (asked.folder / "metrics.jsonl").is_file():
+        while not (wanted.folder / "metrics.jsonl").is_file():
             time.sleep(0.02)
         os.kill(os.getpid(), signal.SIGTERM)
 
@@ -115,27 +115,27 @@ def test_a_stop_lets_the_running_trial_save_and_the_next_time_it_is_resumed(tmp_
         thread = threading.Thread(target=stop_at, args=(expected[0],))
         thread.start()
         with pytest.raises(Interrupted, match="finished trials are kept; the same command continues"):
-            run_trials([asked], jobs=1, description="try")
+            run_trials([wanted], jobs=1, description="try")
         thread.join()
         assert journal(tmp_path)[-2:] == expected
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
 
 
 def test_a_trial_at_which_another_process_works_is_left_to_it(tmp_path):
-    asked = [trial(tmp_path, seed) for seed in (2, 3)]
-    asked[0].log.parent.mkdir(parents=True)
-    with asked[0].log.open("a") as log:
+    wanted = [trial(tmp_path, seed) for seed in (2, 3)]
+    wanted[0].log.parent.mkdir(parents=True)
+    with wanted[0].log.open("a") as log:
         fcntl.flock(log, fcntl.LOCK_EX)
-        assert run_trials(asked, jobs=1, description="try") == {asked[0]: "another process runs it"}
+        assert run_trials(wanted, jobs=1, description="try") == {wanted[0]: "another process runs it"}
     assert journal(tmp_path) == ["start 3", "end 3"]
 
 
 def test_a_folder_without_a_checkpoint_is_begun_anew(tmp_path):
-    asked = trial(tmp_path, 2)
-    asked.folder.mkdir(parents=True)
-    (asked.folder / "half").touch()
-    assert run_trials([asked], jobs=1, description="try") == {}
-    assert not (asked.folder / "half").exists()
+    wanted = trial(tmp_path, 2)
+    wanted.folder.mkdir(parents=True)
+    (wanted.folder / "half").touch()
+    assert run_trials([wanted], jobs=1, description="try") == {}
+    assert not (wanted.folder / "half").exists()
 
 
 @pytest.fixture
@@ -147,8 +147,8 @@ def test_a_trials_folder_says_what_it_is_and_its_flags_make_its_settings(tmp_pat
     found = make_trial(tmp_path, {"base": base, "iterations": 5, "seed": 2, "method": "arft"})
     assert re.fullmatch(rf"arft-punch\+kick-s2-[0-9a-f]{{8}}-{provenance().code}", found.folder.name)
     assert found.flags == ("--iterations", "5", "--seed", "2", "--base", str(base))
-    asked = {"base": base, "iterations": 5, "penalty": 8.0, "wrench": True, "sampler": None, "targets": "run, walk"}
-    other = make_trial(tmp_path, {**asked, "physics": "native", "set": ["ppo.base_kl=0.5", "ppo.epochs=7"]})
+    wanted = {"base": base, "iterations": 5, "penalty": 8.0, "wrench": True, "sampler": None, "targets": "run, walk"}
+    other = make_trial(tmp_path, {**wanted, "physics": "native", "set": ["ppo.base_kl=0.5", "ppo.epochs=7"]})
     assert other.folder.name.startswith("arft-run+walk-s0-")
     assert without_code(other.folder.name) + f"-{provenance().code}" == other.folder.name
     config = other.config
@@ -160,20 +160,20 @@ def test_a_trials_folder_says_what_it_is_and_its_flags_make_its_settings(tmp_pat
 
 
 def test_the_same_question_has_the_same_folder_wherever_its_base_lies(tmp_path, base):
-    asked = {"base": base, "iterations": 5, "penalty": 8.0}
+    wanted = {"base": base, "iterations": 5, "penalty": 8.0}
     moved = Path(shutil.copytree(base, tmp_path / "moved"))
     same = make_trial(tmp_path, {"penalty": 8.0, "iterations": 5, "method": "arft", "base": moved})
-    assert make_trial(tmp_path, asked).folder == same.folder
-    assert make_trial(tmp_path, {**asked, "targets": "punch,kick"}).folder == same.folder  # the default
+    assert make_trial(tmp_path, wanted).folder == same.folder
+    assert make_trial(tmp_path, {**wanted, "targets": "punch,kick"}).folder == same.folder  # the default
     different = [{"penalty": 9.0}, {"iterations": 6}, {"seed": 1}, {"set": ["ppo.base_kl=0.5"]}, {"episodes": 3}]
-    folders = {make_trial(tmp_path, asked | change).folder for change in different}
+    folders = {make_trial(tmp_path, wanted | change).folder for change in different}
     meta = json.loads((base / "meta.json").read_text())
     (base / "meta.json").write_text(json.dumps({**meta, "iteration": meta["iteration"] + 1}))
-    folders.add(make_trial(tmp_path, asked).folder)
+    folders.add(make_trial(tmp_path, wanted).folder)
     library = Path(shutil.copytree(DATA_DIR / "g1", tmp_path / "library", ignore=shutil.ignore_patterns("base")))
-    assert make_trial(tmp_path, {**asked, "base": moved, "library": library}).folder == same.folder
+    assert make_trial(tmp_path, {**wanted, "base": moved, "library": library}).folder == same.folder
     (library / "punch.npz").write_bytes((library / "kick.npz").read_bytes())
-    folders.add(make_trial(tmp_path, {**asked, "base": moved, "library": library}).folder)
+    folders.add(make_trial(tmp_path, {**wanted, "base": moved, "library": library}).folder)
     assert len(folders | {same.folder}) == 8
 
 

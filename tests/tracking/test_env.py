@@ -23,7 +23,7 @@ KEY = jax.random.PRNGKey(0)
 
 @dataclass
 class Puppet:
-    """An engine whose robot goes where the test says, and that keeps what it was told to do."""
+    """An engine whose robot goes where the test says, and that keeps what it was message to do."""
 
     next_physics: PhysicsState | None = None
     next_bodies: BodyState | None = None

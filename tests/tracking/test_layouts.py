@@ -329,7 +329,7 @@ def test_the_actor_meets_noise_and_the_critic_sees_the_actors_terms_without_it(l
 
 
 @pytest.mark.parametrize(
-    ("name", "told"),
+    ("name", "message"),
     [
         ("wbc123", "observation.layout: no layout 'wbc123'; did you mean 'wbc132'?"),
         ("HumanoidVerse380", "observation.layout: 'HumanoidVerse380' is not supported: it needs a history of four "
@@ -340,9 +340,9 @@ def test_the_actor_meets_noise_and_the_critic_sees_the_actors_terms_without_it(l
         ("holosoma154", "it needs its terms in the order of their names; accepted: "),
     ],
 )  # fmt: skip
-def test_a_layout_that_is_not_there_is_refused_by_name_with_what_is_missing(tiny_config, name, told):
+def test_a_layout_that_is_not_there_is_refused_by_name_with_what_is_missing(tiny_config, name, message):
     with pytest.raises(InputError) as error:
         find_layout(name)
-    assert told in str(error.value)
+    assert message in str(error.value)
     with pytest.raises(InputError, match=r"^observation\.layout: "):
         make_setup(dataclasses.replace(tiny_config, observation=ObservationConfig(name)))

@@ -157,12 +157,12 @@ def test_a_checkpoint_of_a_robot_that_has_changed_since_is_told(h2, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         ({"key_bodies": ("pelvis", "torso_link")}, r"key_bodies: 'g1' has 14; 2 are needed, as 'h2' has"),
         ({"joint_names": ("tail_joint",)}, "joints: 'g1' has none that is called as one of 'h2'"),
     ],
 )
-def test_a_robot_that_nothing_can_be_had_from_is_told(h2, change, told):
-    with pytest.raises(InputError, match=f"base: {told}"):
+def test_a_robot_that_nothing_can_be_had_from_is_told(h2, change, message):
+    with pytest.raises(InputError, match=f"base: {message}"):
         policy_for(dataclasses.replace(h2, **change), read_info(DATA_DIR / "g1" / "base"))

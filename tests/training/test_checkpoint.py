@@ -1,4 +1,4 @@
-"""A checkpoint appears whole or not at all, goes back bit for bit, and says which part of it is not what was asked."""
+"""A checkpoint appears whole or not at all, goes back bit for bit, and says which part of it is not what was wanted."""
 
 import dataclasses
 import errno
@@ -153,7 +153,7 @@ def edit_note(path: Path, **changes) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "message"),
     [
         ("{", "damaged: "),
         ("[]", "damaged: "),
@@ -164,9 +164,9 @@ def edit_note(path: Path, **changes) -> None:
         ('{"schema": 3, "robot": "g1", "joints": [], "clips": [], "library_hash": "", "iteration": "x"}', "damaged: "),
     ],
 )
-def test_a_damaged_note_is_told(copy, content, told):
+def test_a_damaged_note_is_told(copy, content, message):
     (copy / "meta.json").write_text(content)
-    with pytest.raises(InputError, match=rf"copy/meta.json: {told}"):
+    with pytest.raises(InputError, match=rf"copy/meta.json: {message}"):
         read_info(copy)
 
 
@@ -228,18 +228,18 @@ def test_other_environments_matter_to_a_resumed_run_only(saved, setup):
 
 
 @pytest.mark.parametrize(
-    ("layers", "told"),
+    ("layers", "message"),
     [
         ([8, 16], r"actor/params/MLP_0/Dense_0/bias: found shape \[16\]; \[8\] is needed"),
         ([16, 16, 16], r"actor/params/MLP_0/Dense_2/bias: found shape \[29\]; \[16\] is needed"),
     ],
 )
-def test_a_network_of_another_size_cannot_slip_through(copy, robot, layers, told):
+def test_a_network_of_another_size_cannot_slip_through(copy, robot, layers, message):
     # A config.yaml that was edited disagrees with the arrays.
     settings = yaml.safe_load((copy / "config.yaml").read_text())
     settings["ppo"]["actor_layers"] = layers
     (copy / "config.yaml").write_text(yaml.safe_dump(settings))
-    with pytest.raises(InputError, match=rf"copy/policy.safetensors: {told}"):
+    with pytest.raises(InputError, match=rf"copy/policy.safetensors: {message}"):
         checkpoint.load_policy(read_info(copy), robot)
 
 
@@ -252,23 +252,23 @@ def other_layout(copy: Path, layout: str) -> None:
 
 def test_a_network_of_another_layout_is_refused(copy, robot):
     other_layout(copy, "mjlab154")
-    told = r"actor: found 132 observations; 154 are needed, with layout mjlab154 of 'g1'"
-    with pytest.raises(InputError, match=rf"copy/policy.safetensors: {told}$"):
+    message = r"actor: found 132 observations; 154 are needed, with layout mjlab154 of 'g1'"
+    with pytest.raises(InputError, match=rf"copy/policy.safetensors: {message}$"):
         checkpoint.load_policy(read_info(copy), robot)
 
 
 def test_a_critic_of_another_size_is_refused(copy, robot):
     """Such as of a version that showed the critic other kernels: the layers of the network say nothing of it."""
     fewer = dataclasses.replace(robot, key_bodies=robot.key_bodies[:-1])
-    told = r"critic: found 624 observations; 591 are needed, with layout wbc132 of 'g1'"
-    with pytest.raises(InputError, match=rf"copy/policy.safetensors: {told}$"):
+    message = r"critic: found 624 observations; 591 are needed, with layout wbc132 of 'g1'"
+    with pytest.raises(InputError, match=rf"copy/policy.safetensors: {message}$"):
         checkpoint.load_policy(read_info(copy), fewer)
 
 
 def test_a_checkpoint_of_another_layout_does_not_match(copy, setup):
     other_layout(copy, "root132")  # of the same size, which only the name tells apart
-    told = r"copy: observation.layout: the checkpoint's is root132, this run's wbc132"
-    with pytest.raises(InputError, match=rf"{told}$"):
+    message = r"copy: observation.layout: the checkpoint's is root132, this run's wbc132"
+    with pytest.raises(InputError, match=rf"{message}$"):
         checkpoint.check_matches(read_info(copy), setup)
 
 

@@ -240,9 +240,9 @@ def test_a_learning_rate_that_was_changed_holds_and_the_state_s_own_otherwise(ru
 def test_a_stop_ends_the_iteration_saves_and_says_how_to_go_on(run, number):
     handler = signal.getsignal(number)
     run.before[4] = lambda: os.kill(os.getpid(), number)
-    with pytest.raises(Interrupted) as told:
+    with pytest.raises(Interrupted) as message:
         run()
-    assert str(told.value) == (
+    assert str(message.value) == (
         f"stopped; saved {run.folder}/checkpoints/00000004; "
         f"continue with: make pretrain ROBOT=g1 RESUME=1 OUTPUT={run.folder}"
     )

@@ -156,6 +156,6 @@ def test_where_nothing_can_be_drawn_one_line_says_what_to_install(monkeypatch):
             offscreen.check_rendering()
     finally:
         offscreen._backend.cache_clear()
-    told = str(error.value)
-    assert told.startswith("rendering: egl and osmesa cannot draw here without a screen; install")
-    assert "\n" not in told
+    message = str(error.value)
+    assert message.startswith("rendering: egl and osmesa cannot draw here without a screen; install")
+    assert "\n" not in message
