@@ -136,10 +136,10 @@ def _attribute(node: onnx.NodeProto, name: str, default: float) -> float:
     return next((onnx.helper.get_attribute_value(each) for each in node.attribute if each.name == name), default)
 
 
-def _check_metadata(metadata: dict[str, str], robot: Robot, config: Config, path: Path) -> None:
+def _check_metadata(found: dict[str, str], robot: Robot, config: Config, path: Path) -> None:
     """What the file says of its robot must be so here. A file may say nothing."""
     for key, here in metadata(robot, config, run_path="").items():
-        there = metadata.get(key, here)
+        there = found.get(key, here)
         if key in ("joint_names", "observation_names", "anchor_body_name", "action_mode") and there != here:
             raise InputError(f"{path}: {key}: {_difference(there.split(','), here.split(','))}")
         if key in ("joint_stiffness", "joint_damping", "default_joint_pos", "action_scale"):
