@@ -13,7 +13,7 @@ from onnx.reference import ReferenceEvaluator
 
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.exchange.imported import ImportedActor
-from forgetmimic_jax.exchange.onnx_actor import INPUT, OUTPUT
+from forgetmimic_jax.exchange.onnx_actor import INPUT, OUTPUT, metadata
 from forgetmimic_jax.policy.normalizer import OBSERVATION_LIMIT
 from forgetmimic_jax.robot.model import Robot
 from forgetmimic_jax.settings.config import Config
