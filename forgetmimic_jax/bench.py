@@ -49,6 +49,7 @@ def main(options: Options) -> None:
     from forgetmimic_jax.ppo.update import make_iteration
     from forgetmimic_jax.settings.config import preset
     from forgetmimic_jax.tracking import env as tracking
+    from forgetmimic_jax.tracking.action import joint_target
     from forgetmimic_jax.tracking.rsi import bin_probabilities
     from forgetmimic_jax.tracking.setup import make_setup
     from forgetmimic_jax.training.folder import check_writable
@@ -83,8 +84,8 @@ def main(options: Options) -> None:
             done = result.terminated | result.truncated
             fresh = tracking.reset_where(env, assets, after, done, reset_key, probabilities, gains)
             observation = tracking.observe(env, assets, fresh, observe_key)
-            target = tracking.lookup(assets.library, episodes.clip, episodes.frame + 1).joint_pos
-            target += assets.robot.action_scale * action
+            reference = tracking.lookup(assets.library, episodes.clip, episodes.frame + 1)
+            target = joint_target(config.action.mode, assets.robot, reference, action)
             return fresh, (episodes.physics, target, observation[0].sum(), result.reward.tracking.sum())
 
         return jax.lax.scan(one_step, episodes, jax.random.split(key, steps))

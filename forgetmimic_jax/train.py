@@ -29,8 +29,8 @@ class Options:
     library: Path | None = None
     """Folder of clips; data/ROBOT by default."""
     base: Path | None = None
-    """Checkpoint whose policy to start from, another robot's too, with its observation layout; a random policy by
-    default."""
+    """Checkpoint whose policy to start from, another robot's too, with its observations and actions; a random
+    policy by default."""
     output: Path | None = None
     """Folder of the run; runs/train-ROBOT by default."""
     resume: bool = False
@@ -42,7 +42,7 @@ class Options:
 def main(options: Options) -> None:
     """Train, and say where the checkpoint is."""
     from forgetmimic_jax.basics.console import closing, command_line
-    from forgetmimic_jax.settings.config import load_config, preset
+    from forgetmimic_jax.settings.config import ActionConfig, load_config, preset
     from forgetmimic_jax.tracking.setup import make_setup
     from forgetmimic_jax.training.checkpoint import read_info
     from forgetmimic_jax.training.folder import BEST, prepare_folder
@@ -62,7 +62,11 @@ def main(options: Options) -> None:
             base=options.base,
         )
         if options.base:
-            config = dataclasses.replace(config, observation=read_info(options.base).config.observation)
+            base = read_info(options.base)
+            action = base.config.action
+            if base.robot != config.robot:  # the joints are others
+                action = ActionConfig(mode=action.mode)
+            config = dataclasses.replace(config, observation=base.config.observation, action=action)
     config = override(replace_given(config, iterations=options.iterations), itertools.chain(*options.set))
     setup = make_setup(on_engine(config, options.physics))
     path, _ = run(setup, output, description=f"train {config.robot}", resume=options.resume)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from forgetmimic_jax.exchange.onnx_actor import OnnxActor
+from forgetmimic_jax.exchange.onnx_actor import ACTION_MODES, OnnxActor
 from forgetmimic_jax.motion.library import Frames
 from forgetmimic_jax.robot.model import Robot
 
@@ -31,7 +31,7 @@ class Deployed:
         self.body = actor.names("body_names").index(actor.metadata["anchor_body_name"])  # among the reference's
         self.body_id = self.model.body(actor.metadata["anchor_body_name"]).id
         self.default, self.scale = actor.numbers("default_joint_pos"), actor.numbers("action_scale")
-        self.offset = actor.metadata["action_mode"] == "default_relative"
+        self.offset = actor.metadata["action_mode"] == ACTION_MODES["offset"]
         stiffness, damping = actor.numbers("joint_stiffness"), actor.numbers("joint_damping")
         self.model.actuator_gainprm[self.joints, 0] = stiffness
         self.model.actuator_biasprm[self.joints, 1] = -stiffness

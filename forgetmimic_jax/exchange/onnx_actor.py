@@ -23,6 +23,8 @@ from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking.layouts import find_layout
 
 INPUT, OUTPUT = "obs", "actions"
+# wbc-mjlab's names. PD target = action_scale · action + reference joints of the next frame, or + default_joint_pos.
+ACTION_MODES = {"residual": "reference_residual", "offset": "default_relative"}
 OPSET, IR_VERSION = 13, 8  # old enough for the runtimes on robots
 
 
@@ -75,18 +77,21 @@ def to_onnx(policy: Policy, robot: Robot, config: Config, *, run_path: str) -> o
 
 
 def metadata(robot: Robot, config: Config, *, run_path: str) -> dict[str, str]:
-    """What a deploy tool must know beside the weights. Numbers have all their digits, where mjlab rounds to three."""
-    arrays, layout = robot.arrays, find_layout(config.observation.layout)
+    """What a deploy tool must know beside the weights; all that is of joints is in the order of `joint_names`.
+
+    Numbers have all their digits, where mjlab rounds to three.
+    """
+    arrays, order, layout = robot.arrays, robot.policy_joints, find_layout(config.observation.layout)
     body = {"anchor": robot.anchor, "root": robot.root}[layout.body]
     return {
         "run_path": run_path,
         "policy_only_export": "true",
-        "action_mode": "reference_residual",  # PD target = reference joints of the next frame + action_scale · action
-        "joint_names": _csv(robot.joint_names),
-        "joint_stiffness": _csv(np.asarray(arrays.stiffness)),
-        "joint_damping": _csv(np.asarray(arrays.damping)),
-        "default_joint_pos": _csv(np.asarray(arrays.default_joint_pos)),
-        "action_scale": _csv(np.asarray(arrays.action_scale)),
+        "action_mode": ACTION_MODES[config.action.mode],
+        "joint_names": _csv(robot.policy_joint_names),
+        "joint_stiffness": _csv(np.asarray(arrays.stiffness)[order]),
+        "joint_damping": _csv(np.asarray(arrays.damping)[order]),
+        "default_joint_pos": _csv(np.asarray(arrays.default_joint_pos)[order]),
+        "action_scale": _csv(np.asarray(arrays.action_scale)[order]),
         "command_names": "motion",
         "observation_names": _csv(term.name for term in layout.terms),
         "anchor_body_name": robot.key_bodies[body],  # whose motion the terms of the reference show

@@ -168,6 +168,6 @@ def _check_numbers(key: str, there: str, here: str, robot: Robot, path: Path) ->
     joint = int(np.argmax(np.abs(found - needed)))
     if not abs(found[joint] - needed[joint]) <= METADATA_TOLERANCE:
         raise InputError(
-            f"{path}: {key}: {robot.joint_names[joint]}: found {found[joint]:.4g}; {robot.name} here has "
+            f"{path}: {key}: {robot.policy_joint_names[joint]}: found {found[joint]:.4g}; {robot.name} here has "
             f"{needed[joint]:.4g}: a policy works with the gains and scales it was trained with"
         )

@@ -20,7 +20,7 @@ from forgetmimic_jax.basics.places import shipped
 from forgetmimic_jax.robot.check import FLOOR
 from forgetmimic_jax.robot.roles import Roles, read_roles
 from forgetmimic_jax.robot.sides import Pairs, body_ids, counterparts, sides_of_bodies
-from forgetmimic_jax.settings.config import PhysicsConfig
+from forgetmimic_jax.settings.config import ActionConfig, PhysicsConfig
 
 ROBOTS_DIR = shipped("robots")
 CONTACT_SENSOR = "contact_"
@@ -52,6 +52,7 @@ class Robot:
     spec: mujoco.MjSpec  # what `model` is compiled from
     model: mujoco.MjModel
     joint_names: tuple[str, ...]
+    policy_joints: np.ndarray  # [joint] index of each joint of the policy's order
     joint_velocity_limit: np.ndarray  # [joint] rad/s, the motor's no-load speed
     joint_lower: np.ndarray  # [joint] rad
     joint_upper: np.ndarray  # [joint] rad
@@ -73,6 +74,11 @@ class Robot:
     @property
     def num_joints(self) -> int:
         return len(self.joint_names)
+
+    @property
+    def policy_joint_names(self) -> tuple[str, ...]:
+        """The joints in the order of a policy's inputs and outputs."""
+        return tuple(self.joint_names[joint] for joint in self.policy_joints)
 
     @property
     def weight(self) -> float:
@@ -111,26 +117,35 @@ def roles_file(name: str, robots_dir: Path = ROBOTS_DIR) -> Path:
     return robots_dir / name / f"{name}.yaml"
 
 
-def load_robot(name: str, physics: PhysicsConfig | None = None, robots_dir: Path = ROBOTS_DIR) -> Robot:
+def load_robot(
+    name: str,
+    physics: PhysicsConfig | None = None,
+    action: ActionConfig | None = None,
+    robots_dir: Path = ROBOTS_DIR,
+) -> Robot:
     """Compile a robot from `robots/NAME/`.
 
     Args:
         name: folder under robots/.
         physics: the physics step, the solver's limits and whether the robot's shapes touch each other; the default
             settings where none are given.
+        action: what a policy expects of the robot in place of the robot's own.
         robots_dir: folder of the robots.
 
     Raises:
-        InputError: unknown robot, or roles that are wrong or do not fit the MJCF.
+        InputError: unknown robot, roles that are wrong or do not fit the MJCF, or a joint in `action` that is not the
+            robot's.
     """
     roles = read_roles(roles_file(name, robots_dir))
     spec = read_spec(name, robots_dir)
     joints = [joint.name for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_HINGE]
-    drives = [_drive(roles, joint) for joint in joints]
+    action = action or ActionConfig()
+    policy_joints = _policy_joints(action, name, joints)
+    drives = [_drive(roles, action, joint) for joint in joints]
     _set_physics(spec, physics or PhysicsConfig())
     _add_motors(spec, drives)
     _add_contact_sensors(spec, roles.key_bodies)
-    return _resolved(name, roles, spec, drives)
+    return _resolved(name, roles, spec, drives, policy_joints)
 
 
 def read_spec(name: str, robots_dir: Path = ROBOTS_DIR) -> mujoco.MjSpec:
@@ -148,19 +163,39 @@ def relative_height(model: mujoco.MjModel) -> float:
     return float(model.body_pos[1, 2]) / G1_ROOT_HEIGHT
 
 
-def _drive(roles: Roles, joint: str) -> Drive:
-    """The PD gains follow from the motor's armature by a natural frequency and a damping ratio."""
+def _policy_joints(action: ActionConfig, robot: str, joint_names: Sequence[str]) -> np.ndarray:
+    """Index of each joint of the policy's order; InputError for a joint that is not the robot's, or not there."""
+    for field, table in vars(action).items():
+        for joint in table if isinstance(table, dict) else ():
+            if joint not in joint_names:
+                raise InputError(f"action.{field}: no joint '{joint}' in {robot}; {nearest(joint, joint_names)}")
+    order = action.joint_order or joint_names
+    if sorted(order) != sorted(joint_names):
+        unknown, missing = set(order) - set(joint_names), set(joint_names) - set(order)
+        raise InputError(
+            f"action.joint_order: found {len(order)} joints (unknown: {', '.join(sorted(unknown)) or 'none'}; missing: "
+            f"{', '.join(sorted(missing)) or 'none'}); the {len(joint_names)} of {robot} are needed, each once"
+        )
+    return np.array([joint_names.index(joint) for joint in order])
+
+
+def _drive(roles: Roles, action: ActionConfig, joint: str) -> Drive:
+    """The PD gains follow from the motor's armature by a natural frequency and a damping ratio.
+
+    What `action` has of the joint takes the place of these.
+    """
     motor, omega = roles.motor_of(joint), 2.0 * np.pi * roles.natural_frequency_hz
     stiffness = motor.armature * omega**2
+    damping = 2.0 * roles.damping_ratio * motor.armature * omega
     return Drive(
         joint,
-        motor.armature,
-        motor.effort,
-        motor.velocity,
-        stiffness,
-        damping=2.0 * roles.damping_ratio * motor.armature * omega,
-        action_scale=0.25 * motor.effort / stiffness,
-        default=roles.default_pose.get(joint, 0.0),
+        armature=action.armature.get(joint, motor.armature),
+        effort=motor.effort,
+        velocity=motor.velocity,
+        stiffness=action.stiffness.get(joint, stiffness),
+        damping=action.damping.get(joint, damping),
+        action_scale=action.scale.get(joint, 0.25 * motor.effort / stiffness),
+        default=action.default_pose.get(joint, roles.default_pose.get(joint, 0.0)),
     )
 
 
@@ -201,7 +236,9 @@ def _add_contact_sensors(spec: mujoco.MjSpec, key_bodies: Sequence[str]) -> None
         sensor.intprm[:3] = [1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3, 1]  # data, reduce=netforce, num
 
 
-def _resolved(name: str, roles: Roles, spec: mujoco.MjSpec, drives: Sequence[Drive]) -> Robot:
+def _resolved(
+    name: str, roles: Roles, spec: mujoco.MjSpec, drives: Sequence[Drive], policy_joints: np.ndarray
+) -> Robot:
     """The roles as indices into the compiled model."""
     model = spec.compile()
     key_bodies, joint_names = roles.key_bodies, tuple(drive.joint for drive in drives)
@@ -229,6 +266,7 @@ def _resolved(name: str, roles: Roles, spec: mujoco.MjSpec, drives: Sequence[Dri
         spec=spec,
         model=model,
         joint_names=joint_names,
+        policy_joints=policy_joints,
         joint_velocity_limit=np.array([drive.velocity for drive in drives]),
         joint_lower=lower,
         joint_upper=upper,

@@ -26,6 +26,7 @@ Positive = Annotated[float, Meta(gt=0, le=LARGEST, description="a number above 0
 BodyWeights = Annotated[float, Meta(ge=0, le=100, description="0 to 100 body weights")]
 Share = Annotated[float, Meta(ge=0, le=1, description="a number from 0 to 1")]
 Weight = Annotated[float, Meta(ge=-LARGEST, le=LARGEST, description="a finite number")]
+Angle = Annotated[float, Meta(ge=-LARGEST, le=LARGEST, description="a finite number of rad")]
 NotComputed = Annotated[float, Meta(ge=0, le=0, description="0 (this term is not computed)")]
 Count = Annotated[int, Meta(ge=1, description="a whole number from 1")]
 Period = Annotated[int, Meta(ge=0, description="a whole number from 0")]

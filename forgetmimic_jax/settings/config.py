@@ -20,6 +20,7 @@ from forgetmimic_jax.basics.errors import InputError, nearest
 from forgetmimic_jax.basics.files import write_atomically
 from forgetmimic_jax.settings.checked import (
     Amount,
+    Angle,
     BodyWeights,
     Count,
     Interval,
@@ -59,6 +60,22 @@ class ObservationConfig:
     """What the actor sees."""
 
     layout: str = "wbc132"  # a name in `tracking.layouts.LAYOUTS`
+
+
+@dataclass(frozen=True)
+class ActionConfig:
+    """What the actor's output does, and the robot that the policy expects, joint by joint.
+
+    A joint that a table leaves out has the robot's own value; without an order, joints are in the robot's own.
+    """
+
+    mode: Literal["residual", "offset"] = "residual"  # added to the reference joints, or to the default pose
+    joint_order: tuple[str, ...] = ()  # of the actor's inputs and outputs
+    default_pose: dict[str, Angle] = field(default_factory=dict)  # rad
+    scale: dict[str, Positive] = field(default_factory=dict)  # rad per unit of action
+    stiffness: dict[str, Positive] = field(default_factory=dict)  # kp, N m/rad
+    damping: dict[str, Amount] = field(default_factory=dict)  # kd, N m s/rad
+    armature: dict[str, Amount] = field(default_factory=dict)  # reflected inertia of the motor, kg m²
 
 
 @dataclass(frozen=True)
@@ -200,6 +217,7 @@ class Config:
     max_episode_steps: Count = 500  # 10 s
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
     observation: ObservationConfig = field(default_factory=ObservationConfig)
+    action: ActionConfig = field(default_factory=ActionConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
     termination: TerminationConfig = field(default_factory=TerminationConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)

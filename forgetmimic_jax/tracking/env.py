@@ -22,6 +22,7 @@ from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.robot.model import Robot, RobotArrays
 from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking import observation, randomise, reward
+from forgetmimic_jax.tracking.action import in_robot_order, joint_target
 from forgetmimic_jax.tracking.layouts import Layout, Moment, find_layout
 from forgetmimic_jax.tracking.reference import align_to_anchor, anchor_between, lookup
 from forgetmimic_jax.tracking.reward import Pair
@@ -55,7 +56,7 @@ class EnvState:
     step: Array  # i32 steps of the episode so far
     horizon: Array  # i32 steps the episode can live: min(max_episode_steps, frames left)
     tracking_sum: Array  # f32 Σ r̄ so far
-    last_action: Array  # f32[env, joint]
+    last_action: Array  # f32[env, joint] the network's output, in the robot's order of joints
     encoder_bias: Array  # f32[env, joint] rad
     wrench_gain: Array  # f32 β, frozen for the episode
     push_countdown: Array  # i32 control steps to the next push
@@ -181,13 +182,14 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
         env: static part.
         assets: constant arrays.
         state: before the step.
-        action: [env, joint]; the PD target is q_ref(t + 1) + action_scale · action.
+        action: [env, joint] the network's output, in the policy's order of joints.
         key: for pushes.
     """
     config, robot = env.config, env.robot
     reference = lookup(assets.library, state.clip, state.frame + 1)
+    action = in_robot_order(robot, action)
     # The joint controller regulates what its encoders read, so their bias moves the robot, not the reading.
-    target = reference.joint_pos + assets.robot.action_scale * action - state.encoder_bias
+    target = joint_target(config.action.mode, assets.robot, reference, action) - state.encoder_bias
 
     physics, countdown = state.physics, state.push_countdown
     if env.noisy:
@@ -274,7 +276,7 @@ def observe(env: Environment, assets: Assets, state: EnvState, key: Array | None
         anchor=robot.anchor,
         root=robot.root,
     )
-    clean = observation.actor_observation(env.layout, moment)
+    clean = observation.actor_observation(env.layout, robot.policy_joints, moment)
     wrench = assist(env, assets, state) if env.config.wrench.max_gain > 0 else jnp.zeros((env.num_envs, 6), jnp.float32)
     critic = observation.critic_observation(
         clean,
@@ -286,7 +288,8 @@ def observe(env: Environment, assets: Assets, state: EnvState, key: Array | None
     )
     if key is None:
         return clean, critic
-    return clean + observation.sensor_noise(env.layout, env.config.noise.sensors, key, state.encoder_bias), critic
+    bias = observation.in_policy_order(state.encoder_bias, robot.policy_joints)
+    return clean + observation.sensor_noise(env.layout, env.config.noise.sensors, key, bias), critic
 
 
 def _all_sane(tree, num_envs: int) -> Array:

@@ -29,7 +29,7 @@ class Moment:
     reference: Frames  # the frame to reach next
     physics: PhysicsState
     bodies: BodyState  # the robot's key bodies
-    last_action: Array  # [env, joint] the network's last output; 0 at the start of an episode
+    last_action: Array  # [env, joint] the network's last output, unscaled; 0 at the start of an episode
     anchor: int = struct.field(pytree_node=False)  # index of the anchor among the key bodies
     root: int = struct.field(pytree_node=False)  # index of the floating base among the key bodies
 

@@ -18,9 +18,26 @@ from forgetmimic_jax.tracking.randomise import symmetric
 from forgetmimic_jax.tracking.reward import TERMS as REWARD_TERMS
 
 
-def actor_observation(layout: Layout, moment: Moment) -> Array:
-    """[env, features] the terms of a layout, without noise or encoder bias."""
-    return jnp.concatenate([term.values(moment) for term in layout.terms], axis=-1)
+def actor_observation(layout: Layout, policy_joints: np.ndarray, moment: Moment) -> Array:
+    """[env, features] the terms of a layout, without noise or encoder bias.
+
+    Args:
+        layout: which terms.
+        policy_joints: i[joint] index of each joint of the policy's order.
+        moment: robot and reference.
+    """
+    return jnp.concatenate(
+        [
+            in_policy_order(term.values(moment), policy_joints) if term.per_joint else term.values(moment)
+            for term in layout.terms
+        ],
+        axis=-1,
+    )
+
+
+def in_policy_order(values: Array, policy_joints: np.ndarray) -> Array:
+    """Values [env, n · joint], n lists of joints in the robot's order, in the policy's order of joints."""
+    return values.reshape(len(values), -1, len(policy_joints))[..., policy_joints].reshape(values.shape)
 
 
 def sensor_noise(layout: Layout, factor: float, key: Array, encoder_bias: Array) -> Array:
@@ -30,7 +47,7 @@ def sensor_noise(layout: Layout, factor: float, key: Array, encoder_bias: Array)
         layout: with the half-width of each term's noise.
         factor: times these half-widths.
         key: of the noise.
-        encoder_bias: [env, joint] rad.
+        encoder_bias: [env, joint] rad, in the policy's order of joints.
     """
     num_envs, joints = encoder_bias.shape
     widths = [np.broadcast_to(layout.sensor_noise[term.name], term.size(joints)) for term in layout.terms]

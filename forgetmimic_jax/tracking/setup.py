@@ -37,7 +37,7 @@ def make_setup(config: Config) -> Setup:
     find_layout(config.observation.layout)
     if not jax.config.values["jax_compilation_cache_dir"]:
         jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "jax"))
-    robot = load_robot(config.robot, config.physics)
+    robot = load_robot(config.robot, config.physics, config.action)
     folder = library_folder(config)
     library = load_library(robot, folder, fps=1.0 / config.physics.control_step)
     check_targets(config.unlearn.targets, library.names)

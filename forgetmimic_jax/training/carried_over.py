@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,8 @@ from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.policy.normalizer import Normalizer
 from forgetmimic_jax.policy.policy import Policy, init_policy
 from forgetmimic_jax.robot.model import Robot, load_robot, relative_height
-from forgetmimic_jax.tracking.layouts import Layout, find_layout
+from forgetmimic_jax.settings.config import Config
+from forgetmimic_jax.tracking.layouts import TERMS, Layout, find_layout
 from forgetmimic_jax.tracking.observation import critic_size
 from forgetmimic_jax.training.checkpoint import CheckpointInfo, load_policy
 
@@ -33,7 +34,7 @@ def policy_for(robot: Robot, info: CheckpointInfo) -> Policy:
         InputError: the robots have no joint, or not as many key bodies, in common, or the source has changed.
     """
     path, name = info.path, info.robot
-    source = load_robot(name)
+    source = load_robot(name, action=info.config.action)
     if info.joints != source.joint_names:
         raise InputError(f"{path}: joints: not those of robots/{name} today, in their order")
     found, needed = len(source.key_bodies), len(robot.key_bodies)
@@ -44,52 +45,91 @@ def policy_for(robot: Robot, info: CheckpointInfo) -> Policy:
     layout, key = find_layout(info.config.observation.layout), jax.random.PRNGKey(info.config.seed)
     sizes = layout.size(robot.num_joints), critic_size(layout, robot)
     fresh = init_policy(info.config.ppo, robot.num_joints, *sizes, key)
-    return carried_over(load_policy(info, source), layout, source, robot, fresh)
+    return carried_over(load_policy(info, source), info.config, source, robot, fresh)
 
 
-def carried_over(policy: Policy, layout: Layout, source: Robot, target: Robot, fresh: Policy) -> Policy:
+def carried_over(policy: Policy, config: Config, source: Robot, target: Robot, fresh: Policy) -> Policy:
     """`policy` of robot `source` as a start for `target`: inputs and outputs go with the joint they belong to, by name.
 
-    A joint that only the target has starts unheard, its action at 0, which follows the reference; one that only the
-    source has is left out. Means of the observations move with the default pose and the height. What the critic alone
-    sees is per key body, in the order of the robots' roles, and stays in place.
+    A joint that only the target has starts unheard, its action at 0; one that only the source has is left out. Means of
+    the observations move with the default pose and the height. A residual action stays as it is, the same share of the
+    joint's torque; an action on the default pose becomes the one of the same joint target. What the critic alone sees
+    is per key body, in the order of the robots' roles, and stays in place.
 
     Args:
         policy: of the source.
-        layout: of what both see.
+        config: of the source: what both see, and what an action is added to.
         source: robot of as many key bodies as the target, in the same roles.
         target: another robot.
         fresh: a random policy of the target, with the same hidden layers.
     """
-    joints, rows, output = (
-        shared_joints(source, target),
-        _features(layout, source, target),
-        (np.arange(1), np.arange(1)),
-    )
+    layout, places = find_layout(config.observation.layout), shared_joints(source, target)
+    actions = _actions(config, source, target)
+    rows, output = _features(layout, source, target), (np.arange(1), np.arange(1))
     size, new_size = policy.actor_normalizer.mean.size, fresh.actor_normalizer.mean.size
     private = np.arange(policy.critic_normalizer.mean.size - size)  # of the critic alone
     critic_rows = (np.append(rows[0], size + private), np.append(rows[1], new_size + private))
     normalizers = (policy.actor_normalizer, policy.critic_normalizer)
-    means, critic_means = (_moved_means(normalizer.mean, layout, source, target) for normalizer in normalizers)
+    actor_normalizer, critic_normalizer = (_moved(of, layout, actions, source, target) for of in normalizers)
     actor, critic = policy.actor["params"], policy.critic["params"]
     log_std = np.full(target.num_joints, np.mean(actor["log_std"]), np.float32)
-    log_std[joints[1]] = np.asarray(actor["log_std"])[joints[0]]
-    actor = {"MLP_0": _placed(actor["MLP_0"], fresh.actor["params"]["MLP_0"], rows, joints), "log_std": log_std}
+    log_std[places[1]] = (np.asarray(actor["log_std"]) + np.log(actions.ratio))[places[0]]
+    actor = {
+        "MLP_0": _placed(actions.of(actor["MLP_0"]), fresh.actor["params"]["MLP_0"], rows, places),
+        "log_std": log_std,
+    }
     critic = {"MLP_0": _placed(critic["MLP_0"], fresh.critic["params"]["MLP_0"], critic_rows, output)}
     carried = dataclasses.replace(
         fresh,
         actor={"params": actor},
         critic={"params": critic},
-        actor_normalizer=_statistics(policy.actor_normalizer, fresh.actor_normalizer, means, rows),
-        critic_normalizer=_statistics(policy.critic_normalizer, fresh.critic_normalizer, critic_means, critic_rows),
+        actor_normalizer=_statistics(actor_normalizer, fresh.actor_normalizer, rows),
+        critic_normalizer=_statistics(critic_normalizer, fresh.critic_normalizer, critic_rows),
     )
     return jax.tree.map(lambda new, like: jnp.asarray(new, like.dtype), carried, fresh)
 
 
+class Actions(NamedTuple):
+    """What an action of the source becomes for the target, joint by joint: ratio · action + shift."""
+
+    ratio: np.ndarray  # [joint] in the source's policy order
+    shift: np.ndarray
+
+    def of(self, layers: Mapping[str, Any]) -> Mapping[str, Any]:
+        """A perceptron's layers with such an output."""
+        last = f"Dense_{len(layers) - 1}"
+        kernel, bias = (np.asarray(layers[last][part]) for part in ("kernel", "bias"))
+        return {**layers, last: {"kernel": kernel * self.ratio, "bias": bias * self.ratio + self.shift}}
+
+
+def _actions(config: Config, source: Robot, target: Robot) -> Actions:
+    """Of a residual: the same action. On the default pose: the action that asks for the same joint target."""
+    actions = Actions(np.ones(source.num_joints), np.zeros(source.num_joints))
+    if config.action.mode == "offset":
+        ours, theirs = shared_joints(source, target)
+        scale, new_scale = (_in_policy_order(robot, "action_scale") for robot in (source, target))
+        actions.ratio[ours] = scale[ours] / new_scale[theirs]
+        actions.shift[ours] = _pose_change(source, target) / new_scale[theirs]
+    return actions
+
+
+def _in_policy_order(robot: Robot, field: str) -> np.ndarray:
+    """Constants [joint] of a robot in its policy's order of joints."""
+    return np.asarray(getattr(robot.arrays, field))[robot.policy_joints]
+
+
+def _pose_change(source: Robot, target: Robot) -> np.ndarray:
+    """The source's default pose less the target's, rad, of the joints that both have."""
+    poses = (_in_policy_order(robot, "default_joint_pos") for robot in (source, target))
+    here, there = (pose[joints] for pose, joints in zip(poses, shared_joints(source, target), strict=True))
+    return here - there
+
+
 def shared_joints(source: Robot, target: Robot) -> Places:
-    """The joints that both robots have, as places among the source's and among the target's."""
-    names = [name for name in source.joint_names if name in target.joint_names]
-    return tuple(np.array([robot.joint_names.index(name) for name in names], int) for robot in (source, target))  # type: ignore[return-value]
+    """The joints that both robots have, as places in the source's and in the target's policy order."""
+    orders = source.policy_joint_names, target.policy_joint_names
+    names = [name for name in orders[0] if name in orders[1]]
+    return tuple(np.array([order.index(name) for name in names], int) for order in orders)  # type: ignore[return-value]
 
 
 def _features(layout: Layout, source: Robot, target: Robot) -> Places:
@@ -105,17 +145,18 @@ def _features(layout: Layout, source: Robot, target: Robot) -> Places:
     return result[0], result[1]
 
 
-def _moved_means(mean: Any, layout: Layout, source: Robot, target: Robot) -> np.ndarray:
-    """Means of the source's observations, actor's first, for a robot of the target's height and default pose."""
-    places, means = layout.places(source.num_joints), np.array(mean)
-    ours, theirs = shared_joints(source, target)
-    moved = np.asarray(source.arrays.default_joint_pos)[ours] - np.asarray(target.arrays.default_joint_pos)[theirs]
-    for term in layout.terms:
-        if term.height:
-            means[places[term.name]] *= relative_height(target.model) / relative_height(source.model)
-        if term.encoder:
-            means[places[term.name]][ours] += moved  # a slice is a view, so this changes `means`
-    return means
+def _moved(of: Normalizer, layout: Layout, actions: Actions, source: Robot, target: Robot) -> Normalizer:
+    """Statistics of the source's observations, actor's first, for a robot of the target's height, pose and actions."""
+    mean, variance = np.array(of.mean), np.array(of.variance)
+    for name, here in layout.places(source.num_joints).items():  # a slice is a view: what follows changes the arrays
+        if TERMS[name].height:
+            mean[here] *= relative_height(target.model) / relative_height(source.model)
+        if TERMS[name].encoder:
+            mean[here][shared_joints(source, target)[0]] += _pose_change(source, target)
+        if name == "actions":
+            mean[here] = mean[here] * actions.ratio + actions.shift
+            variance[here] *= actions.ratio**2
+    return Normalizer(jnp.asarray(mean), jnp.asarray(variance), of.count)
 
 
 def _placed(layers: Mapping[str, Any], fresh: Mapping[str, Any], inputs: Places, outputs: Places) -> Any:
@@ -131,8 +172,8 @@ def _placed(layers: Mapping[str, Any], fresh: Mapping[str, Any], inputs: Places,
     return result | {names[-1]: last}
 
 
-def _statistics(old: Normalizer, fresh: Normalizer, means: np.ndarray, places: Places) -> Normalizer:
+def _statistics(old: Normalizer, fresh: Normalizer, places: Places) -> Normalizer:
     """Statistics at their new places; an observation that is new has none yet: its variance is 0."""
     mean, variance = np.zeros(fresh.mean.shape, np.float32), np.zeros(fresh.mean.shape, np.float32)
-    mean[places[1]], variance[places[1]] = means[places[0]], np.asarray(old.variance)[places[0]]
+    mean[places[1]], variance[places[1]] = old.mean[places[0]], old.variance[places[0]]
     return Normalizer(jnp.asarray(mean), jnp.asarray(variance), jnp.minimum(old.count, REMEMBERED))

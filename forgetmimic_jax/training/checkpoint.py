@@ -32,7 +32,7 @@ from forgetmimic_jax.basics.provenance import made_here
 from forgetmimic_jax.policy.policy import Policy, init_policy
 from forgetmimic_jax.ppo.state import TrainState
 from forgetmimic_jax.robot.model import Robot
-from forgetmimic_jax.settings.config import Config, load_config, save_config, to_dict
+from forgetmimic_jax.settings.config import ActionConfig, Config, by_name, load_config, save_config
 from forgetmimic_jax.tracking.layouts import find_layout
 from forgetmimic_jax.tracking.observation import critic_size
 from forgetmimic_jax.tracking.rsi import Bins
@@ -192,7 +192,7 @@ def check_matches(
     other_robot: bool = False,
     resume: bool = False,
 ) -> None:
-    """InputError where robot, joints, library, observation or network of a checkpoint differ from the setup's.
+    """InputError where robot, joints, library, observation, action or network of a checkpoint differ from the setup's.
 
     Args:
         info: of the checkpoint.
@@ -222,16 +222,16 @@ def check_matches(
             f"{info.path}: library: the checkpoint's hash is {info.library_hash}, this library's {library_hash} "
             f"({difference or 'same clip names, other content'})"
         )
-    shaping = [("observation", "layout"), ("ppo", "actor_layers"), ("ppo", "critic_layers")]
+    shaping = ["observation.layout", "action.mode", "ppo.actor_layers", "ppo.critic_layers"]
+    if not other_robot:
+        shaping += [f"action.{field.name}" for field in dataclasses.fields(ActionConfig)]
     if resume:
-        shaping += [("ppo", "num_envs"), ("sampling", "bin_seconds")]
-    theirs, ours = to_dict(info.config), to_dict(setup.config)
-    for section, name in shaping:
-        if theirs[section][name] != ours[section][name]:
-            raise InputError(
-                f"{info.path}: {section}.{name}: the checkpoint's is {theirs[section][name]}, "
-                f"this run's {ours[section][name]}"
-            )
+        shaping += ["ppo.num_envs", "sampling.bin_seconds"]
+    theirs, ours = by_name(info.config), by_name(setup.config)
+    for name in {**theirs, **ours}:
+        found, needed = (values.get(name, "the robot's own") for values in (theirs, ours))
+        if found != needed and any(name == of or name.startswith(f"{of}.") for of in shaping):
+            raise InputError(f"{info.path}: {name}: the checkpoint's is {found}, this run's {needed}")
 
 
 def policy_hash(info: CheckpointInfo) -> str:

@@ -111,12 +111,13 @@ def config_of_new_run(options: Options) -> Config:
 
 
 def _on_preset(base: Config, name: str) -> Config:
-    """A preset's settings with what the base's policy brings: its observation, network, bins and clips."""
+    """A preset's settings with what the base's policy brings: its observations, actions, network, bins and clips."""
     config = preset(name)
     return dataclasses.replace(
         config,
         library=base.library,
         observation=base.observation,
+        action=base.action,
         sampling=dataclasses.replace(config.sampling, bin_seconds=base.sampling.bin_seconds),
         ppo=dataclasses.replace(config.ppo, actor_layers=base.ppo.actor_layers, critic_layers=base.ppo.critic_layers),
     )

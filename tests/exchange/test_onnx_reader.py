@@ -147,6 +147,7 @@ def test_other_inputs_or_outputs_are_told(robot, save, exported, tiny_config):
             "found 'joint_vel' at",
         ),
         ("observation_names", lambda x: x.replace("ref_", "motion_"), "found 'motion_base_height' at place 0; 'ref_b"),
+        ("anchor_body_name", lambda x: "pelvis", "found 'pelvis'; 'torso_link' is needed"),
         ("action_mode", lambda x: "default_relative", "found 'default_relative'; 'reference_residual' is needed"),
         ("action_scale", lambda x: "0.25", "left_hip_pitch_joint: found 0.25; g1 here has 0.5475: a policy works with"),
         ("action_scale", lambda x: "0.25,0.25", "found 2 numbers; 29 are needed"),

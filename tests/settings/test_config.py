@@ -135,6 +135,12 @@ def test_the_hash_does_not_see_how_long_or_how_often(name):
             {"noise": {"push_interval": [1.0]}},
             "here: noise.push_interval: found [1.0]; accepted: a list of 2: a number from 0",
         ),
+        ({"action": {"mode": "absolute"}}, "here: action.mode: found 'absolute'; accepted: residual, offset"),
+        (
+            {"action": {"scale": {"left_knee_joint": -1}}},
+            "here: action.scale: found {'left_knee_joint': -1}; accepted: a table of: a number above 0",
+        ),
+        ({"action": {"damping": 3}}, "here: action.damping: found 3; accepted: a table of: a number from 0"),
     ],
 )
 def test_a_bad_setting_is_told_with_its_place_and_what_is_accepted(content, message):

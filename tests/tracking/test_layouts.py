@@ -8,11 +8,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from orders import isaac_order
 from scene import as_reference, body_velocity, key_bodies, moved, physics_state, posed
 from scipy.spatial.transform import Rotation
 
 from forgetmimic_jax.basics.errors import InputError
-from forgetmimic_jax.settings.config import ObservationConfig
+from forgetmimic_jax.robot.model import load_robot
+from forgetmimic_jax.settings.config import ActionConfig, ObservationConfig
 from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.tracking.env import Environment, make_assets
 from forgetmimic_jax.tracking.layouts import LAYOUTS, Moment, find_layout
@@ -103,32 +105,36 @@ def with_bent_waist(robot, seed: int, bend: float) -> mujoco.MjData:
 
 
 class Scene:
-    """A robot in one random pose, a reference in another, by MuJoCo. The waists are bent and turn."""
+    """A robot in one random pose, a reference in another, by MuJoCo. The waists are bent and turn.
 
-    def __init__(self, robot):
-        self.robot = robot
+    Angles, speeds and actions are in the policy's order of joints.
+    """
+
+    def __init__(self, robot, order: tuple[str, ...]):
+        self.robot, self.order = robot, order
         self.here, self.there = (with_bent_waist(robot, seed, bend) for seed, bend in ((1, 1.0), (2, -1.0)))
         self.last_action = np.linspace(-1.0, 1.0, robot.num_joints)
         self.torso, self.pelvis = (Body(robot, self.here, name) for name in ("torso_link", "pelvis"))
         self.ref_torso, self.ref_pelvis = (Body(robot, self.there, name) for name in ("torso_link", "pelvis"))
-        self.default = [robot.arrays.default_joint_pos[robot.joint_names.index(name)] for name in robot.joint_names]
+        self.default = [robot.arrays.default_joint_pos[robot.joint_names.index(name)] for name in order]
 
     def moment(self) -> Moment:
+        by_name = dict(zip(self.order, self.last_action, strict=True))
         return Moment(
             robot=self.robot.arrays,
             reference=as_reference(self.robot, self.there),
             physics=physics_state(self.here),
             bodies=key_bodies(self.robot, self.here),
-            last_action=jnp.asarray(self.last_action, jnp.float32)[None],
+            last_action=jnp.asarray([[by_name[name] for name in self.robot.joint_names]], jnp.float32),
             anchor=self.robot.anchor,
             root=self.robot.root,
         )
 
     def angles(self, data: mujoco.MjData) -> np.ndarray:
-        return np.array([data.qpos[self.robot.model.joint(name).qposadr[0]] for name in self.robot.joint_names])
+        return np.array([data.qpos[self.robot.model.joint(name).qposadr[0]] for name in self.order])
 
     def speeds(self, data: mujoco.MjData) -> np.ndarray:
-        return np.array([data.qvel[self.robot.model.joint(name).dofadr[0]] for name in self.robot.joint_names])
+        return np.array([data.qvel[self.robot.model.joint(name).dofadr[0]] for name in self.order])
 
 
 def gyro(scene: Scene) -> np.ndarray:
@@ -166,9 +172,17 @@ DEFINITIONS: dict[str, Callable[[Scene], np.ndarray]] = {
 }
 
 
-@pytest.fixture(scope="module")
-def scene(robot) -> Scene:
-    return Scene(robot)
+@pytest.fixture(scope="module", params=["mjlab's order", "Isaac Lab's order"])
+def scene(request, robot) -> Scene:
+    if request.param == "mjlab's order":
+        return Scene(robot, robot.joint_names)
+    order = isaac_order(robot)
+    return Scene(load_robot("g1", action=ActionConfig(joint_order=order)), order)
+
+
+def observation(scene: Scene, layout: str, moment: Moment | None = None) -> np.ndarray:
+    """[1, features] of the scene, or of another moment."""
+    return np.asarray(actor_observation(LAYOUTS[layout], scene.robot.policy_joints, moment or scene.moment()))
 
 
 @pytest.fixture(scope="module", params=LAYOUT)
@@ -178,7 +192,7 @@ def layout(request) -> str:
 
 @pytest.fixture(scope="module")
 def seen(scene, layout) -> np.ndarray:
-    return np.asarray(actor_observation(LAYOUTS[layout], scene.moment()))[0]
+    return observation(scene, layout)[0]
 
 
 def test_torso_and_pelvis_differ_strongly_in_the_scene(scene):
@@ -212,14 +226,14 @@ def test_every_term_is_what_its_definition_says(scene, layout, seen):
 @pytest.mark.parametrize("name", LAYOUT)
 def test_who_knows_place_and_heading(scene, name):
     """Robot and reference both moved and turned as one leave every layout as it was; each alone only those of wbc."""
-    layout, moment = LAYOUTS[name], scene.moment()
-    before = np.asarray(actor_observation(layout, moment))
+    moment, before = scene.moment(), observation(scene, name)
     turn, shift = 1.3, (4.0, -2.0)
     everything, reference_alone = (moved(moment, turn, shift, robot=together) for together in (True, False))
-    np.testing.assert_allclose(actor_observation(layout, everything), before, atol=1e-5)
-    difference = np.abs(np.asarray(actor_observation(layout, reference_alone)) - before)[0]
-    changed = {term for term, at in layout.places(29).items() if difference[at].max() > 1e-4}
-    expected = {"motion_anchor_pos_b", "motion_anchor_ori_b"} & {term.name for term in layout.terms}
+    np.testing.assert_allclose(observation(scene, name, everything), before, atol=1e-5)
+    difference = np.abs(observation(scene, name, reference_alone) - before)[0]
+    terms = [term for term, *_ in LAYOUT[name]]
+    changed = {term for term in terms if difference[place(name, term)].max() > 1e-4}
+    expected = {"motion_anchor_pos_b", "motion_anchor_ori_b"} & set(terms)
     assert changed == expected
 
 
@@ -227,8 +241,8 @@ def test_gravity_points_down_for_an_upright_robot(scene):
     moment = scene.moment()
     qpos = moment.physics.qpos.at[0, 3:7].set(jnp.array([1.0, 0.0, 0.0, 0.0]))
     upright = dataclasses.replace(moment, physics=dataclasses.replace(moment.physics, qpos=qpos))
-    observation = np.asarray(actor_observation(LAYOUTS["wbc132"], upright))[0]
-    np.testing.assert_allclose(observation[place("wbc132", "projected_gravity")], DOWN, atol=1e-6)
+    seen = observation(scene, "wbc132", upright)[0]
+    np.testing.assert_allclose(seen[place("wbc132", "projected_gravity")], DOWN, atol=1e-6)
 
 
 # What sensors add.

@@ -272,6 +272,37 @@ def test_a_checkpoint_of_another_layout_does_not_match(copy, setup):
         checkpoint.check_matches(read_info(copy), setup)
 
 
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"mode": "offset"}, "action.mode: the checkpoint's is residual, this run's offset"),
+        (
+            {"default_pose": {"left_knee_joint": 0.3}},
+            "action.default_pose.left_knee_joint: the checkpoint's is the robot's own, this run's 0.3",
+        ),
+        ({"stiffness": {"left_knee_joint": 80.0}}, "action.stiffness.left_knee_joint: the checkpoint's is the robot's"),
+        ({"joint_order": ("a", "b")}, "action.joint_order: the checkpoint's is [], this run's ['a', 'b']"),
+    ],
+)
+def test_a_checkpoint_whose_actions_mean_something_else_does_not_match(saved, setup, change, told):
+    action = dataclasses.replace(setup.config.action, **change)
+    other = dataclasses.replace(setup, config=dataclasses.replace(setup.config, action=action))
+    with pytest.raises(InputError) as error:
+        checkpoint.check_matches(read_info(saved), other)
+    assert str(error.value).removeprefix(f"{saved}: ").startswith(told)
+
+
+def test_another_robots_actions_may_differ_in_all_but_their_mode(saved, setup):
+    def check(**change) -> None:
+        action = dataclasses.replace(setup.config.action, **change)
+        other = dataclasses.replace(setup, config=dataclasses.replace(setup.config, action=action))
+        checkpoint.check_matches(read_info(saved), other, other_robot=True)
+
+    check(default_pose={"left_knee_joint": 0.3}, joint_order=("a", "b"))
+    with pytest.raises(InputError, match=r"action.mode: "):
+        check(mode="offset")
+
+
 def test_the_newest_is_the_highest_whole_one(tmp_path, saved):
     assert newest_checkpoint(tmp_path) is None
     for name in ("00000009", "00000100", "00000200 (copy)", "best", ".00000300.tmp", "00000400"):
