@@ -15,6 +15,7 @@ import json
 import os
 import re
 import shutil
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -53,6 +54,7 @@ class CheckpointInfo:
     environment_steps: int
     files: dict[str, str]  # sha256 of policy.safetensors and of each file of run/
     base: str | None  # `policy_hash` of the checkpoint that unlearning started from
+    curriculum: Mapping[str, Any] | None  # of pretraining, how far it had come
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,7 @@ class Progress:
     iteration: int
     environment_steps: int  # control steps of all environments, with those of the base that training continued from
     base: str | None = None  # of an unlearning run, the `policy_hash` of the checkpoint it started from
+    curriculum: Mapping[str, Any] | None = None  # of pretraining, how far it has come, in plain values
 
 
 def save_checkpoint(path: Path, setup: Setup, state: TrainState, progress: Progress) -> None:
@@ -154,6 +157,7 @@ def read_info(path: Path) -> CheckpointInfo:
             environment_steps=int(meta["environment_steps"]),
             files=dict(meta["files"]),
             base=meta.get("base"),
+            curriculum=meta.get("curriculum"),
         )
     except FileNotFoundError:
         newest = newest_checkpoint(path)
