@@ -204,6 +204,8 @@ def _begin(seen: Curriculum, phase: Phase, specialists: tuple[str, ...] = (), lo
     best = seen.best.clips
     clips = {
         name: ClipProgress(best[name], best[name].tracking, 0, clip.completed or best[name].success > 0.0)
+        if name in specialists[:1] or not specialists
+        else clip
         for name, clip in seen.clips.items()
     }
     return dataclasses.replace(

@@ -128,7 +128,7 @@ def test_lagging_ends_when_every_clip_is_mastered_or_stuck():
     curve = [found(0.86, 0.5, 0.1), found(0.86, 0.505, 0.1)]
     assert phases(LAGGING, *curve, first=4) == ["lagging", "stuck kick"]
     curve = [found(0.86, 0.5, 0.1), found(0.86, 0.6, 0.1), found(0.86, 0.78, 0.1), found(0.86, 0.78, 0.1)]
-    assert phases(LAGGING, *curve, first=4) == ["lagging", "lagging", "stuck flip"] + ["stuck flip"]
+    assert phases(LAGGING, *curve, first=4) == ["lagging", "lagging", "stuck flip", "stuck flip"]
 
 
 STUCK = after(LAGGING, found(0.86, 0.5, 0.1), found(0.86, 0.505, 0.1), first=4)
@@ -155,7 +155,7 @@ def test_a_specialist_ends_with_its_clip_mastered_stuck_or_its_time():
 def test_a_specialists_evaluation_says_nothing_of_other_clips():
     now = after(STUCK, found(0.1, 0.55, 0.0), first=6)
     assert now.clips["walk"].last.tracking == 0.86
-    assert now.states(RULES)["walk"] == "mastered"
+    assert now.states(RULES) == {"walk": "mastered", "kick": "learning", "flip": "stuck"}
     assert now.best == STUCK.best
 
 
