@@ -42,8 +42,8 @@ class Options:
     library: Path | None = None
     """Folder of clips; data/ROBOT by default."""
     base: Path | None = None
-    """Checkpoint whose policy to start from, another robot's too. By default the shipped base for a library of your
-    own, and a random policy for the shipped library."""
+    """Checkpoint whose policy to start from, another robot's too; none: a random policy. By default the shipped base
+    for a library of your own, and a random policy for the shipped library."""
     output: Path | None = None
     """Folder of the run; runs/pretrain-ROBOT by default."""
     resume: bool = False
@@ -87,6 +87,7 @@ def config_of(options: Options, output: Path) -> Config:
         check_same(options, {name: getattr(config, name) for name in ("robot", "preset", "seed", "library", "base")})
     else:
         base = options.base or (shipped_base(options.robot) if options.library else None)
+        base = None if str(base) == "none" else base
         config = dataclasses.replace(preset(options.preset), **LENGTH[options.preset], evaluate_episodes=EPISODES)
         config = replace_given(config, robot=options.robot, seed=options.seed, library=options.library, base=base)
     config = override(replace_given(config, iterations=options.iterations), itertools.chain(*options.set))
