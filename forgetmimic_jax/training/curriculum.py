@@ -199,12 +199,15 @@ def _next_specialist(config: Config, seen: Curriculum, clips: tuple[str, ...], d
 
 
 def _begin(seen: Curriculum, phase: Phase, specialists: tuple[str, ...] = (), longest: int = 0) -> Curriculum:
-    """The best policy starts a phase, or a specialist; progress is counted from what it can do."""
+    """The best policy starts a phase, or a specialist; progress is counted from what it can do.
+
+    A clip that waits for its specialist, or had it, stays as it was.
+    """
     assert seen.best is not None
     best = seen.best.clips
     clips = {
         name: ClipProgress(best[name], best[name].tracking, 0, clip.completed or best[name].success > 0.0)
-        if name in specialists[:1] or not specialists
+        if name in specialists[:1] or phase not in ("stuck", "distil")
         else clip
         for name, clip in seen.clips.items()
     }

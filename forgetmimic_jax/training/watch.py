@@ -64,16 +64,14 @@ class Watch:
         """Success of every clip over the last evaluations, for the terminal."""
         from rich.table import Table
 
-        rows = read_rows(self._path)[-8:]
-        table = Table(title="success (survival-weighted tracking) by environment steps", title_justify="left", box=None)
-        table.add_column("clip")
-        for row in rows:
-            table.add_column(f"{row['environment_steps'] / 1e6:.1f}M", justify="right")
-        table.add_column("")
+        rows = read_rows(self._path)[-6:]
+        table = Table(
+            title="success and survival-weighted tracking by environment steps", title_justify="left", box=None
+        )
+        for column in ("clip", "", *(f"{row['environment_steps'] / 1e6:.1f}M" for row in rows)):
+            table.add_column(column, justify="right" if column.endswith("M") else "left", no_wrap=True)
         for clip in self._names:
-            cells = [_cell(row, clip) for row in rows]
-            state = [rows[-1]["clips"][clip].get("state", "")] if rows else []
-            table.add_row(clip, *cells, *state)
+            table.add_row(clip, rows[-1]["clips"][clip].get("state", ""), *(_cell(row, clip) for row in rows))
         return table
 
 
@@ -82,4 +80,4 @@ def _cell(row: dict[str, Any], clip: str) -> str:
     if row.get("specialist", clip) != clip:
         return ""
     values = row["clips"][clip]
-    return f"{values['success_rate']:.0%} ({values['survival_weighted_tracking']:.2f})"
+    return f"{values['success_rate']:.0%} {values['survival_weighted_tracking']:.2f}"
