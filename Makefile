@@ -9,7 +9,7 @@
 ## LAMBDA       the penalty λ on the targets' tracking reward, --penalty (default: 16)
 ## PRESET       cpu or paper (default: cpu)
 ## LIBRARY      folder of clips (default: data/ROBOT)
-## BASE         the policy to start from (default: the shipped one; for pretrain, none)
+## BASE         the policy to start from (default: the shipped one; for pretrain and train, none)
 ## CHECKPOINT   the policy to evaluate, export, play or film (default: the shipped base)
 ## RUN          folder of the run to report on
 ## OUTPUT       where the results go (default: under runs/)
@@ -27,13 +27,13 @@ flag_value = $(if $(filter $(1),$(SWITCHES)),$(filter-out 1,$($(1))),'$(subst ',
 flag = $(if $($(1)),--$(call flag_name,$(1)) $(call flag_value,$(1)))
 FLAGS = $(foreach name,$(filter-out ARGS PYTHON SWEEP,$(given)),$(call flag,$(name)))
 
-COMMANDS = unlearn evaluate export play video report motions bench
+COMMANDS = pretrain train unlearn evaluate export play video report motions bench
 STUDIES = validity comparison penalty heat_map motion_types physical_behaviour training_dynamics relearning membership \
 	number_of_targets
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help $(COMMANDS) pretrain sweep experiments tables test mutants lint format clean
+.PHONY: help $(COMMANDS) sweep experiments tables test mutants lint format clean
 
 help: ## this list
 	@echo 'make TARGET [VARIABLE=value ...]'
@@ -43,6 +43,8 @@ help: ## this list
 	@echo
 	@sed -n 's/^## /  /p' Makefile
 
+pretrain: ## train a base policy on every clip of LIBRARY, in phases, unattended (hours)
+train: ## train by plain PPO, as the paper does
 unlearn: ## forget TARGETS, then evaluate base and unlearned policy side by side
 evaluate: ## evaluate CHECKPOINT clip by clip
 export: ## write CHECKPOINT as ONNX for deploy tools, checked in plain MuJoCo
@@ -53,9 +55,6 @@ motions: ## make a library from your own clips (ARGS=--help says how)
 bench: ## measure the speed of training on this machine
 $(COMMANDS): .venv/.installed
 	$(PROGRAM) $@ $(strip $(ARGS) $(FLAGS))
-
-pretrain: .venv/.installed ## train a base policy on every clip
-	$(PROGRAM) train $(strip $(ARGS) $(FLAGS))
 
 sweep: .venv/.installed ## several unlearning runs that differ in one thing, with table and figure
 	$(PROGRAM) sweep $(or $(SWEEP),lambda) $(strip $(ARGS) $(FLAGS))

@@ -50,7 +50,6 @@ def main(options: Options) -> None:
     from forgetmimic_jax.settings.config import preset
     from forgetmimic_jax.tracking import env as tracking
     from forgetmimic_jax.tracking.action import joint_target
-    from forgetmimic_jax.tracking.rsi import bin_probabilities
     from forgetmimic_jax.tracking.setup import make_setup
     from forgetmimic_jax.training.folder import check_writable
     from forgetmimic_jax.training.start import start_state
@@ -72,7 +71,7 @@ def main(options: Options) -> None:
     first_iteration = make_iteration(env, Rule())
     state, _ = jax.block_until_ready(first_iteration(assets, state))
     to_first_step = time.perf_counter() - started
-    probabilities = bin_probabilities(config.sampling, assets.bins, state.failure_level, assets.is_target)
+    probabilities = tracking.start_probabilities(config, assets, state.failure_level)
     gains = jnp.zeros_like(probabilities)
 
     @jax.jit

@@ -235,7 +235,7 @@ def _open(
 
 
 def _train(robot: Robot, folder: Path) -> str:
-    return command_line("train", robot=robot.name, library=folder)
+    return command_line("pretrain", robot=robot.name, library=folder)
 
 
 if __name__ == "__main__":

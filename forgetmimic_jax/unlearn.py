@@ -52,7 +52,7 @@ def main(options: Options) -> None:
             seed=config.seed,
         )
     except KeyboardInterrupt:
-        raise interrupted(config, output) from None
+        raise interrupted(config, output, "unlearn") from None
     name = f"{method.result.replace('_', '-')} policy"
     files = {name: path, **show_and_write(output, document), "curves": output / "metrics.jsonl"}
     closing(files, command_line("evaluate", robot=config.robot, checkpoint=path, episodes=100))

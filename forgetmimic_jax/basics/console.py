@@ -85,10 +85,9 @@ def command_line(command: str, *words: str, **flags: object) -> str:
     """
     given = {name: value for name, value in flags.items() if value is not None}
     if "MAKELEVEL" in os.environ:
-        target = {"train": "pretrain"}.get(command, command)
         arguments = [f"ARGS={_word(' '.join(words))}"] if words else []
         arguments += [f"{name.upper()}={_word(value)}" for name, value in given.items()]
-        return " ".join(["make", target, *arguments])
+        return " ".join(["make", command, *arguments])
     parts = [f"--{name}" if value is True else f"--{name} {_word(value)}" for name, value in given.items()]
     return " ".join(["forgetmimic", command, *words, *parts])
 

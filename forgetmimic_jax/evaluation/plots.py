@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 STEPS = ("iteration", "environment_steps")
+STATE_COLOURS = {"new": "0.93", "learning": "#fff3d6", "mastered": "#dcf2dc", "stuck": "#f9dcdc"}
 GROUP_COLOURS = {"target": "tab:red", "kept": "tab:blue"}
 
 
@@ -75,23 +76,49 @@ def training_curves(metrics_file: Path, path: Path | TextIO, *, keys: Sequence[s
 
 
 def clips_over_time(evaluations_file: Path, path: Path) -> None:
-    """One panel a clip of a run's evaluations.jsonl: success and tracking over environment steps; a PNG."""
+    """One panel a clip of a run's evaluations.jsonl: success and tracking over environment steps; a PNG.
+
+    Of pretraining also the clip's state, as the colour behind, and a specialist's evaluations as points of their own.
+    """
     rows = read_rows(evaluations_file)
-    steps = [row["environment_steps"] / 1e6 for row in rows]
     clips = list(rows[0]["clips"])
     columns = min(4, len(clips))
     lines = -(-len(clips) // columns)
     figure = new_figure(width=3.0 * columns, height=2.0 * lines)
     for panel, clip in enumerate(clips):
         axes = figure.add_subplot(lines, columns, panel + 1)
-        for metric, marker in (("success_rate", "o"), ("survival_weighted_tracking", "s")):
-            values = [row["clips"][clip][metric] for row in rows]
-            axes.plot(steps, values, marker=marker, markersize=3, label=metric.replace("_", " "))
+        for metric, marker, colour in (("success_rate", "o", "C0"), ("survival_weighted_tracking", "s", "C1")):
+            for line, own in (("-", False), ("", True)):
+                shown = [row for row in rows if ("specialist" in row) == own and row.get("specialist", clip) == clip]
+                points = [(row["environment_steps"] / 1e6, row["clips"][clip][metric]) for row in shown]
+                axes.plot(
+                    *zip(*points, strict=True) if points else ([], []),
+                    linestyle=line,
+                    marker=marker,
+                    markersize=3,
+                    color=colour,
+                    markerfacecolor="white" if own else colour,
+                    label=None if own else metric.replace("_", " "),
+                )
+        _shade_states(axes, rows, clip)
         axes.set_ylim(-0.03, 1.03)
-        axes.set_title(clip, fontsize="small")
+        axes.set_title(" · ".join([clip, *_state(rows[-1], clip)]), fontsize="small")
     figure.axes[0].legend(fontsize="x-small")
     figure.supxlabel("environment steps (millions)", fontsize="small")
     save(figure, path)
+
+
+def _state(row: Mapping[str, Any], clip: str) -> list[str]:
+    """The state of a clip in a row of pretraining, as a list of one; none in other rows."""
+    return [row["clips"][clip]["state"]] if "state" in row["clips"][clip] else []
+
+
+def _shade_states(axes: Axes, rows: Sequence[Mapping[str, Any]], clip: str) -> None:
+    """The state of a clip behind its curves, from each evaluation to the next."""
+    ends = [row["environment_steps"] / 1e6 for row in rows]
+    for begin, end, row in zip([0.0, *ends], ends, rows, strict=False):
+        for state in _state(row, clip):
+            axes.axvspan(begin, end, color=STATE_COLOURS[state], linewidth=0)
 
 
 def unlearning_curves(rows: Sequence[Mapping[str, Any]], path: Path | TextIO, *, penalty: float | None) -> None:

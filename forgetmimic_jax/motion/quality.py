@@ -78,6 +78,11 @@ class Quality:
                     f"off the floor it accelerates at {self.flight_acceleration:.1f} m/s^2 upwards, not -9.8",
                 )
             )
+        return [words for failed, words in checks if failed] + self.infeasibilities()
+
+    def infeasibilities(self) -> list[str]:
+        """Why no policy may be able to follow the clip, in words; empty where nothing says so."""
+        checks = []
         if self.missing_acceleration is not None:
             missing = f"for {MISSING_SECONDS} s it needs {self.missing_acceleration:.1f} m/s^2 that no contact gives"
             checks.append((self.missing_acceleration > MAX_MISSING, missing))

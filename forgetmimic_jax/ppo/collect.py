@@ -14,7 +14,7 @@ from forgetmimic_jax.ppo.state import TrainState
 from forgetmimic_jax.ppo.transition import Outcome, Transition
 from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.tracking.env import Assets, Environment
-from forgetmimic_jax.tracking.rsi import bin_probabilities, episode_failure, sample_start
+from forgetmimic_jax.tracking.rsi import episode_failure, sample_start
 from forgetmimic_jax.tracking.wrench import wrench_gain
 
 
@@ -24,7 +24,7 @@ def collect(env: Environment, assets: Assets, state: TrainState, rule: Rule) -> 
     With `branches`, every group of environments starts from the state of its first one.
     """
     config, policy = env.config, state.policy
-    probabilities = bin_probabilities(config.sampling, assets.bins, state.failure_level, assets.is_target)
+    probabilities = tracking.start_probabilities(config, assets, state.failure_level)
     gains = wrench_gain(config.wrench, state.failure_level)
 
     def observe(episodes: tracking.EnvState, key: Array) -> tuple[Array, Array]:
@@ -80,7 +80,7 @@ def collect(env: Environment, assets: Assets, state: TrainState, rule: Rule) -> 
 def draw_states(env: Environment, assets: Assets, state: TrainState) -> tuple[TrainState, Transition]:
     """Starts of episodes in the place of a rollout: nothing moves, nothing is rewarded and no episode ends."""
     config, policy = env.config, state.policy
-    probabilities = bin_probabilities(config.sampling, assets.bins, state.failure_level, assets.is_target)
+    probabilities = tracking.start_probabilities(config, assets, state.failure_level)
     no_gain = jnp.zeros((env.num_envs,), jnp.float32)
 
     def one_batch(key: Array) -> Transition:

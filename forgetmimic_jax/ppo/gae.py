@@ -14,7 +14,7 @@ def generalized_advantages(
     terminated: Array,
     truncated: Array,
     discount: float,
-    gae_lambda: float,
+    gae_lambda: Array | float,
 ) -> tuple[Array, Array]:
     """Advantages and value targets, each [time, env] (Schulman et al. 2016, equation 16).
 

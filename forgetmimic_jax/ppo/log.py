@@ -10,8 +10,7 @@ from forgetmimic_jax.ppo.state import TrainState
 from forgetmimic_jax.ppo.threshold import threshold_metrics
 from forgetmimic_jax.ppo.transition import Outcome
 from forgetmimic_jax.settings.config import Config
-from forgetmimic_jax.tracking.env import Assets
-from forgetmimic_jax.tracking.rsi import bin_probabilities
+from forgetmimic_jax.tracking.env import Assets, start_probabilities
 
 
 def rollout_metrics(
@@ -27,7 +26,7 @@ def rollout_metrics(
         outcome: of each step; None where states were drawn and nothing was simulated.
     """
     clips = len(assets.is_target)
-    probabilities = bin_probabilities(config.sampling, assets.bins, state.failure_level, assets.is_target)
+    probabilities = start_probabilities(config, assets, state.failure_level)
 
     def per_clip(values: Array) -> Array:
         return jax.ops.segment_sum(values.reshape(-1).astype(jnp.float32), clip.reshape(-1), clips)

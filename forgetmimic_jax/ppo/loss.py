@@ -33,6 +33,7 @@ class Batch:
     is_target: Array  # bool: the step's clip is to be forgotten
     weight: Array  # in the means of the PPO losses
     base: Prediction | None  # of the frozen base policy, where there is one
+    base_kl: Array | None  # weight of the KL to it at the step
 
 
 def ppo_loss(
@@ -55,10 +56,11 @@ def ppo_loss(
     entropy_term = entropy(now.log_std)
     loss = policy_term + ppo.value_cost * value_term - ppo.entropy_cost * entropy_term
     metrics = {"policy_loss": policy_term, "value_loss": value_term, "entropy": entropy_term}
-    if ppo.base_kl and batch.base is not None:
+    if batch.base is not None and batch.base_kl is not None:
         away = kl_divergence(now.mean, now.log_std, batch.base.mean, batch.base.log_std)
-        metrics["base_kl"] = mean(away, batch.weight * ~batch.is_target)
-        loss += ppo.base_kl * metrics["base_kl"]
+        weight = batch.weight * (batch.base_kl > 0)
+        metrics["base_kl"] = mean(away, weight)
+        loss += mean(batch.base_kl * away, weight)
     return loss, metrics
 
 
@@ -99,7 +101,7 @@ def equal_share(group: Array, groups: int) -> Array:
 
 
 def adapt_learning_rate(
-    learning_rate: Array, kl: Array, target_kl: float, min_learning_rate: float, max_learning_rate: float
+    learning_rate: Array, kl: Array, target_kl: Array | float, min_learning_rate: float, max_learning_rate: float
 ) -> Array:
     """÷1.5 above twice the target KL, ×1.5 below half of it, inside the bounds."""
     factor = jnp.where(kl > 2.0 * target_kl, 1.0 / 1.5, jnp.where((kl < 0.5 * target_kl) & (kl > 0.0), 1.5, 1.0))

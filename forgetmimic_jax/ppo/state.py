@@ -13,8 +13,16 @@ from jax import Array
 
 from forgetmimic_jax.policy.policy import Policy, init_policy
 from forgetmimic_jax.settings.config import PPOConfig
-from forgetmimic_jax.tracking.env import Assets, Environment, EnvState, observe, reset_where, start_episodes
-from forgetmimic_jax.tracking.rsi import bin_probabilities, initial_failure_level
+from forgetmimic_jax.tracking.env import (
+    Assets,
+    Environment,
+    EnvState,
+    observe,
+    reset_where,
+    start_episodes,
+    start_probabilities,
+)
+from forgetmimic_jax.tracking.rsi import initial_failure_level
 from forgetmimic_jax.tracking.wrench import wrench_gain
 
 
@@ -55,7 +63,7 @@ def init_state(
         failure_level = initial_failure_level(config.sampling, assets.bins)
     zeros = jnp.zeros((env.num_envs,), jnp.int32)
     episodes = start_episodes(env, assets, episode_key, zeros, zeros, zeros, zeros.astype(jnp.float32))
-    probabilities = bin_probabilities(config.sampling, assets.bins, failure_level, assets.is_target)
+    probabilities = start_probabilities(config, assets, failure_level)
     gains = wrench_gain(config.wrench, failure_level)
     episodes = reset_where(env, assets, episodes, jnp.ones((env.num_envs,), bool), start_key, probabilities, gains)
     if policy is None:

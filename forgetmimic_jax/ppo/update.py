@@ -24,6 +24,7 @@ from forgetmimic_jax.ppo.state import TrainState, make_optimizer
 from forgetmimic_jax.ppo.transition import Outcome, Transition
 from forgetmimic_jax.settings.config import Config, PPOConfig
 from forgetmimic_jax.tracking.env import Assets, Environment
+from forgetmimic_jax.tracking.focus import Focus
 from forgetmimic_jax.tracking.rsi import update_failure_level
 
 Metrics = dict[str, Array]
@@ -34,9 +35,9 @@ def make_iteration(env: Environment, rule: Rule) -> Callable[[Assets, TrainState
 
     def on_rollout(assets: Assets, state: TrainState) -> tuple[TrainState, Metrics]:
         state, transition, outcome = collect(env, assets, state, rule)
-        advantage, value_target = advantages(env.config.ppo, outcome)
+        advantage, value_target = advantages(env.config.ppo, assets.focus.gae_lambda, outcome)
         batch = make_batch(env.config, assets, transition, outcome.value, advantage, value_target)
-        state, losses = improve(env.config, state, batch, rule)
+        state, losses = improve(env.config, assets.focus, state, batch, rule)
         state = learn_normalizers(state, transition)
         state = learn_sampler(env.config, state, transition.clip, outcome)
         metrics = losses | rollout_metrics(env.config, assets, state, transition.clip, outcome)
@@ -46,14 +47,14 @@ def make_iteration(env: Environment, rule: Rule) -> Callable[[Assets, TrainState
         state, transition = draw_states(env, assets, state)
         nothing = jnp.zeros(transition.clip.shape, jnp.float32)
         batch = make_batch(env.config, assets, transition, nothing, nothing, nothing)
-        state, losses = improve(env.config, state, batch, rule)
+        state, losses = improve(env.config, assets.focus, state, batch, rule)
         metrics = losses | rollout_metrics(env.config, assets, state, transition.clip, None)
         return dataclasses.replace(state, iteration=state.iteration + 1), metrics
 
     return jax.jit(on_rollout if rule.simulate else on_drawn_states, donate_argnums=1)
 
 
-def advantages(config: PPOConfig, outcome: Outcome) -> tuple[Array, Array]:
+def advantages(config: PPOConfig, gae_lambda: Array, outcome: Outcome) -> tuple[Array, Array]:
     """Advantages and value targets [time, env]; with branches, less the mean of the other branches."""
     advantage, value_target = generalized_advantages(
         outcome.reward,
@@ -62,7 +63,7 @@ def advantages(config: PPOConfig, outcome: Outcome) -> tuple[Array, Array]:
         outcome.terminated,
         outcome.truncated,
         config.discount,
-        config.gae_lambda,
+        gae_lambda,
     )
     if config.branches > 1:
         advantage = centre_branches(advantage, outcome.done, config.branches)
@@ -82,6 +83,7 @@ def make_batch(
         is_target=assets.is_target[transition.clip],
         weight=weight,
         base=None if assets.base is None else _at_every_step(predict(assets.base, transition)),
+        base_kl=None if assets.focus.base_kl is None else assets.focus.base_kl[transition.clip],
     )
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
 
@@ -97,7 +99,7 @@ def _at_every_step(prediction: Prediction) -> Prediction:
     return dataclasses.replace(prediction, log_std=jnp.broadcast_to(prediction.log_std, prediction.mean.shape))
 
 
-def improve(run: Config, state: TrainState, batch: Batch, rule: Rule) -> tuple[TrainState, Metrics]:
+def improve(run: Config, focus: Focus, state: TrainState, batch: Batch, rule: Rule) -> tuple[TrainState, Metrics]:
     """Epochs of mini-batch gradient steps."""
     config, policy = run.ppo, state.policy
     optimizer = make_optimizer(config)
@@ -110,7 +112,7 @@ def improve(run: Config, state: TrainState, batch: Batch, rule: Rule) -> tuple[T
 
     def adapt(learning_rate: Array, kl: Array) -> Array:
         bounds = config.min_learning_rate, config.max_learning_rate
-        return adapt_learning_rate(learning_rate, kl, config.target_kl, *bounds)
+        return adapt_learning_rate(learning_rate, kl, focus.target_kl, *bounds)
 
     def minibatch(carry, indices: Array):
         parameters, optimizer_state, learning_rate = carry

@@ -193,6 +193,28 @@ class PPOConfig:
 
 
 @dataclass(frozen=True)
+class PretrainConfig:
+    """The phases of pretraining, which are in training/curriculum.py; ordinary training has none.
+
+    Tracking is survival-weighted. Progress is counted from one evaluation to the next (`evaluate_every` iterations).
+    """
+
+    mastered: Share = 0.9  # success from which a clip is mastered
+    gain: Positive = 0.01  # rise of a tracking above its record that counts as progress
+    patience: Count = 3  # evaluations without progress after which a clip is stuck, or a phase ends
+    lagging_share: Share = 0.75  # of the steps, for the clips that are new or learning, in the phase `lagging`
+    best_kl: Amount = 0.1  # weight of KL(π ‖ π_best) on the clips that the best policy has mastered, there
+    target_kl: Positive = 0.012  # in the place of ppo.target_kl in every phase but the first
+    gae_lambda: Share = 0.97  # in the place of ppo.gae_lambda, likewise
+    broad_until: Share = 0.5  # of the iterations: the end of a phase that still makes progress
+    lagging_until: Share = 0.7
+    stuck_until: Share = 0.9  # what remains is for the phase `settle`
+    specialist_evaluations: Count = 8  # the longest training of a specialist
+    search_rounds: Period = 75  # of the search for a first success; 0: no search
+    distil_rounds: Count = 80
+
+
+@dataclass(frozen=True)
 class UnlearnConfig:
     """The unlearning flag: clips to forget, and how. No targets: ordinary training."""
 
@@ -225,6 +247,7 @@ class Config:
     wrench: WrenchConfig = field(default_factory=WrenchConfig)
     ppo: PPOConfig = field(default_factory=PPOConfig)
     unlearn: UnlearnConfig = field(default_factory=UnlearnConfig)
+    pretrain: PretrainConfig = field(default_factory=PretrainConfig)
 
 
 # What a preset changes of the paper's settings. `cpu` is what trains best on a laptop's cores (docs/findings.md):
@@ -313,7 +336,7 @@ def by_name(config: Config) -> dict[str, Any]:
 def config_hash(config: Config) -> str:
     """Content hash (16 hex digits) of every setting that changes a result."""
     content = to_dict(config)
-    for neutral in ("base", "checkpoint_every", "evaluate_every", "evaluate_episodes", "iterations"):
+    for neutral in ("base", "checkpoint_every", "evaluate_every", "evaluate_episodes", "iterations", "pretrain"):
         content.pop(neutral)
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 

@@ -23,10 +23,11 @@ from forgetmimic_jax.robot.model import Robot, RobotArrays
 from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking import observation, randomise, reward
 from forgetmimic_jax.tracking.action import in_robot_order, joint_target
+from forgetmimic_jax.tracking.focus import Focus, focus_of
 from forgetmimic_jax.tracking.layouts import Layout, Moment, find_layout
 from forgetmimic_jax.tracking.reference import align_to_anchor, anchor_between, lookup
 from forgetmimic_jax.tracking.reward import Pair
-from forgetmimic_jax.tracking.rsi import Bins, make_bins, sample_start
+from forgetmimic_jax.tracking.rsi import Bins, bin_probabilities, make_bins, sample_start
 from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.tracking.termination import terminations
 from forgetmimic_jax.tracking.wrench import reference_wrench
@@ -40,7 +41,8 @@ class Assets:
     library: MotionLibrary
     bins: Bins
     is_target: Array  # bool[clip] the clips to forget
-    base: Policy | None = None  # the frozen policy that an unlearning run compares with
+    focus: Focus
+    base: Policy | None = None  # the frozen policy that an unlearning run, or a phase of pretraining, compares with
 
 
 @struct.dataclass
@@ -115,7 +117,13 @@ def make_assets(setup: Setup) -> Assets:
     bins = make_bins(library, config.sampling.bin_seconds, config.physics.control_step)
     if config.sampling.clips == "kept":
         bins = dataclasses.replace(bins, valid=bins.valid & ~is_target[:, None])
-    return Assets(robot=setup.robot.arrays, library=library, bins=bins, is_target=is_target, base=setup.base)
+    focus = focus_of(config.ppo, is_target)
+    return Assets(setup.robot.arrays, library, bins, is_target, focus, setup.base)
+
+
+def start_probabilities(config: Config, assets: Assets, failure_level: Array) -> Array:
+    """p [clip, bin] of starting an episode in each bin, at failure levels L [clip, bin]."""
+    return bin_probabilities(config.sampling, assets.bins, failure_level, assets.is_target, assets.focus.starts)
 
 
 def start_episodes(

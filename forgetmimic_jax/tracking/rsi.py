@@ -55,7 +55,11 @@ def initial_failure_level(config: SamplingConfig, bins: Bins) -> Array:
 
 
 def bin_probabilities(
-    config: SamplingConfig, bins: Bins, failure_level: Array, is_target: Array | None = None
+    config: SamplingConfig,
+    bins: Bins,
+    failure_level: Array,
+    is_target: Array | None = None,
+    starts: Array | None = None,
 ) -> Array:
     """p [clip, bin] of starting in each bin.
 
@@ -63,9 +67,12 @@ def bin_probabilities(
     L is no longer updated. The prior p0 is the paper's 1/N_valid, or with `prior` clips the same for every clip.
     uniform_bins: 1/N_valid. uniform_clips: a clip uniformly, then a frame uniformly.
 
-    With `target_share` the clips of is_target (bool[clip]) get that share of it all, and the others the rest.
+    With `target_share` the clips of is_target (bool[clip]) get that share of it all, and the others the rest. With
+    `starts` every clip gets its share [clip], and the rule decides among its bins alone.
     """
     probabilities = _by_rule(config, bins, failure_level)
+    if starts is not None:
+        return starts[:, None] * probabilities / probabilities.sum(-1, keepdims=True)
     if not config.target_share or is_target is None:
         return probabilities
     targets, kept = probabilities * is_target[:, None], probabilities * ~is_target[:, None]

@@ -15,6 +15,7 @@ import json
 import os
 import re
 import shutil
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -58,6 +59,7 @@ class CheckpointInfo:
     files: dict[str, str]  # sha256 of policy.safetensors and of each file of run/
     base: str | None  # `policy_hash` of the checkpoint that unlearning started from
     made: dict[str, Any]  # its Provenance; empty in a checkpoint of an earlier version
+    curriculum: Mapping[str, Any] | None  # of pretraining, how far it had come
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,7 @@ class Progress:
     iteration: int
     environment_steps: int  # control steps of all environments, with those of the base that training continued from
     base: str | None = None  # of an unlearning run, the `policy_hash` of the checkpoint it started from
+    curriculum: Mapping[str, Any] | None = None  # of pretraining, how far it has come, in plain values
 
 
 def save_checkpoint(path: Path, setup: Setup, state: TrainState, progress: Progress) -> None:
@@ -161,6 +164,7 @@ def read_info(path: Path) -> CheckpointInfo:
             files=dict(meta["files"]),
             base=meta.get("base"),
             made=dict(meta.get("made", {})),
+            curriculum=meta.get("curriculum"),
         )
     except FileNotFoundError:
         newest = newest_checkpoint(path)

@@ -45,8 +45,18 @@ class Log:
         """Count an iteration's metrics into the next row."""
         self._rows.append(metrics)
 
-    def write(self, iteration: int, environment_steps: int, clips: tuple[str, ...]) -> None:
-        """Write the row of the iterations since the last one, if there are any."""
+    def write(
+        self, iteration: int, environment_steps: int, clips: tuple[str, ...], note: Mapping[str, Any] | None = None
+    ) -> None:
+        """Write the row of the iterations since the last one, if there are any.
+
+        Args:
+            iteration: of the run.
+            environment_steps: of the run.
+            clips: names.
+            note: more of the row's fields; what stands under `clips` joins the clips' parts.
+        """
+        note = dict(note or {})
         rows, self._rows = self._rows, []
         if not rows:
             return
@@ -56,12 +66,14 @@ class Log:
         out |= {name: float(value) for name, value in mean.items() if np.ndim(value) == 0 and name not in absent}
         now = time.monotonic()
         out["seconds"], self._last_row = round(now - self._last_row, 2), now
-        out["clips"] = clip_rows(mean, clips)
+        of_clips = note.pop("clips", {})
+        out |= note
+        out["clips"] = {clip: of_clips.get(clip, {}) | row for clip, row in clip_rows(mean, clips).items()}
         self._file.write(json.dumps(out) + "\n")
         self._file.flush()
         scalars = {name: value for name, value in out.items() if isinstance(value, float)}
         for clip, values in out["clips"].items():
-            scalars |= {f"{clip}/{name}": value for name, value in values.items()}
+            scalars |= {f"{clip}/{name}": value for name, value in values.items() if isinstance(value, float)}
         summary = Summary(value=[Summary.Value(tag=name, simple_value=value) for name, value in scalars.items()])
         self._write_event(environment_steps, summary=summary)
 

@@ -21,18 +21,20 @@ from forgetmimic_jax.tracking.env import make_assets, make_environment
 from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.training import checkpoint
 from forgetmimic_jax.training.checkpoint import Progress, checkpoints, newest_checkpoint
-from forgetmimic_jax.training.folder import BEST, prepare_folder
+from forgetmimic_jax.training.course import MakeCourse, Plain, Position
+from forgetmimic_jax.training.folder import prepare_folder
 from forgetmimic_jax.training.log import Log
-from forgetmimic_jax.training.start import another_machine, base_checkpoint, saved_state, start_state, steps_before
-from forgetmimic_jax.training.watch import Watch
+from forgetmimic_jax.training.start import another_machine, saved_state, start_state, steps_before, unlearned_base
 from forgetmimic_jax.unlearning.registry import method_of
 
 KEEP = 2  # newest checkpoints kept beside the named ones
 LOG_EVERY = 10  # iterations averaged into one row of metrics.jsonl; the first has a row of its own
 
 
-def run(setup: Setup, directory: Path, *, description: str, resume: bool = False) -> tuple[Path, TrainState]:
-    """Train until `config.iterations`; returns the last checkpoint's folder and the state.
+def run(
+    setup: Setup, directory: Path, *, description: str, resume: bool = False, make_course: MakeCourse = Plain
+) -> tuple[Path, TrainState]:
+    """Train until `config.iterations`, or until the course is finished; returns the last checkpoint and the state.
 
     The folder gets config.yaml, metrics.jsonl (means over LOG_EVERY iterations), TensorBoard events and checkpoints/,
     the first of them before the first iteration, so that a run that is killed can always continue. With
@@ -41,26 +43,28 @@ def run(setup: Setup, directory: Path, *, description: str, resume: bool = False
     Interrupted.
     """
     config = setup.config
-    base = checkpoint.policy_hash(checkpoint.read_info(base_checkpoint(config))) if config.unlearn.targets else None
+    base = unlearned_base(config)
     newest = prepare_folder(directory, resume=resume)
     env, assets = make_environment(setup, config.ppo.num_envs), make_assets(setup)
     if newest is None:
-        state, environment_steps = start_state(setup, env, assets), steps_before(config)
+        now = Position(start_state(setup, env, assets), assets, 0, steps_before(config))
     else:
         state, environment_steps = saved_state(setup, env, assets, newest)
-    iteration = int(state.iteration)
+        now = Position(state, assets, int(state.iteration), environment_steps)
     iterate = make_iteration(env, method_of(config))
     directory.mkdir(parents=True, exist_ok=True)
     console = Console()
     if newest and (difference := another_machine(newest)):
         console.print(difference, highlight=False, markup=False, soft_wrap=True)
+    course = make_course(setup, env, directory, console, checkpoint.read_info(newest) if newest else None)
     saved = newest
 
     def save() -> Path:
         # A row never spans a checkpoint: what is resumed has all of its rows in the file.
-        log.write(iteration, environment_steps, setup.library.names)
-        path = directory / "checkpoints" / f"{iteration:08d}"
-        checkpoint.save_checkpoint(path, setup, state, Progress(iteration, environment_steps, base))
+        log.write(now.iteration, now.environment_steps, setup.library.names, course.note)
+        path = directory / "checkpoints" / f"{now.iteration:08d}"
+        progress = Progress(now.iteration, now.environment_steps, base, course.curriculum)
+        checkpoint.save_checkpoint(path, setup, now.state, progress)
         for old in checkpoints(directory)[:-KEEP]:
             shutil.rmtree(old)
         return path
@@ -68,46 +72,42 @@ def run(setup: Setup, directory: Path, *, description: str, resume: bool = False
     try:
         save_config(config, directory / "config.yaml")
         with (
-            Log(directory, iteration, environment_steps) as log,
+            Log(directory, now.iteration, now.environment_steps) as log,
             stop_requests() as stop,
-            progress_bar(description, config.iterations, start=iteration, console=console) as report,
+            progress_bar(description, config.iterations, start=now.iteration, console=console) as report,
         ):
-            watch = Watch(setup, directory, iteration) if config.evaluate_every else None
+            now = course.begin(now)
             saved = saved or save()
-            while iteration < config.iterations and not stop:
-                state, metrics = iterate(assets, state)
+            while now.iteration < config.iterations and not course.finished and not stop:
+                state, metrics = iterate(now.assets, now.state)
                 metrics = jax.device_get(metrics)
-                iteration += 1
-                environment_steps += config.ppo.num_envs * config.ppo.num_steps
+                steps = now.environment_steps + config.ppo.num_envs * config.ppo.num_steps
+                now = Position(state, now.assets, now.iteration + 1, steps)
                 log.add(metrics)
-                if iteration == 1 or iteration % LOG_EVERY == 0:
-                    log.write(iteration, environment_steps, setup.library.names)
-                report(iteration, environment_steps, _live(metrics))
-                if watch and iteration % config.evaluate_every == 0:
-                    if watch(state.policy, iteration, environment_steps):
-                        progress = Progress(iteration, environment_steps, base)
-                        checkpoint.save_policy(directory / BEST, setup, state.policy, state.failure_level, progress)
-                    console.print(watch.table())
-                if iteration % config.checkpoint_every == 0:
+                if now.iteration == 1 or now.iteration % LOG_EVERY == 0:
+                    log.write(now.iteration, steps, setup.library.names, course.note)
+                report(now.iteration, steps, _live(metrics))
+                if config.evaluate_every and now.iteration % config.evaluate_every == 0:
+                    now = course.evaluated(now)
+                if now.iteration % config.checkpoint_every == 0:
                     saved = save()  # after the evaluation, which a run that is resumed from here does not make again
-            if int(saved.name) != iteration:
+            if int(saved.name) != now.iteration:
                 saved = save()
     except BaseException as error:
         if saved is None:
             shutil.rmtree(directory, ignore_errors=True)  # nothing in it to continue with
         elif isinstance(error, KeyboardInterrupt):
-            raise interrupted(config, directory) from None
+            raise interrupted(config, directory, course.command) from None
         elif isinstance(error, OSError) and error.filename is None:
             error.filename = str(directory)  # a full disk does not say where
         raise
     if stop:
-        raise interrupted(config, directory)
-    return saved, state
+        raise interrupted(config, directory, course.command)
+    return saved, now.state
 
 
-def interrupted(config: Config, directory: Path) -> Interrupted:
+def interrupted(config: Config, directory: Path, command: str) -> Interrupted:
     """What a stopped run says at its end: what it saved, and the command that continues it."""
-    command = "unlearn" if config.unlearn.targets else "train"
     again = command_line(command, robot=config.robot, resume=True, output=directory)
     return Interrupted(f"stopped; saved {newest_checkpoint(directory)}; continue with: {again}")
 

@@ -29,15 +29,27 @@ def base_folder(robot: str) -> Path:
         InputError: unknown robot, or none is shipped for it.
     """
     roles_file(robot)
-    folder = DATA_DIR / robot / "base"
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no policy is shipped for '{robot}'; train one and name its checkpoint")
+    folder = shipped_base(robot)
+    if folder is None:
+        missing = DATA_DIR / robot / "base"
+        raise InputError(f"{missing}: no policy is shipped for '{robot}'; train one and name its checkpoint")
     return folder
+
+
+def shipped_base(robot: str) -> Path | None:
+    """The folder of a robot's shipped base policy, if one is shipped."""
+    folder = DATA_DIR / robot / "base"
+    return folder if folder.is_dir() else None
 
 
 def base_checkpoint(config: Config) -> Path:
     """The checkpoint that an unlearning run starts from: the one it names, or the shipped one."""
     return base_folder(config.robot) if config.base is None else Path(config.base)
+
+
+def unlearned_base(config: Config) -> str | None:
+    """`policy_hash` of the checkpoint that an unlearning run starts from; None for training."""
+    return checkpoint.policy_hash(checkpoint.read_info(base_checkpoint(config))) if config.unlearn.targets else None
 
 
 def fresh_policy(setup: Setup, assets: Assets) -> Policy:

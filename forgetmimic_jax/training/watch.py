@@ -17,7 +17,7 @@ from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.tracking.setup import Setup
 
 FILE = "evaluations.jsonl"
-SHOWN = ("success_rate", "survival_weighted_tracking", "tracking_reward")
+SHOWN = ("success_rate", "survival_weighted_tracking", "tracking_reward", "episode_length")
 
 
 def clip_means(rollout: Rollout, names: Sequence[str]) -> dict[str, dict[str, float]]:
@@ -42,14 +42,17 @@ class Watch:
         rows = drop_rows_after(self._path, iteration)
         self._best = max((row["kept_tracking"] for row in rows), default=-1.0)
 
-    def __call__(self, policy: Policy, iteration: int, environment_steps: int) -> bool:
-        """Evaluate, add a row; whether the clips to keep have their best mean survival-weighted tracking so far."""
+    def measure(self, policy: Policy, iteration: int, environment_steps: int) -> dict[str, Any]:
+        """The row of a policy; its `kept_tracking` is the mean survival-weighted tracking of the clips to keep."""
         rollout = self._evaluator.rollout(policy)
         metrics = episode_metrics(rollout)
         row: dict[str, Any] = {"iteration": iteration, "environment_steps": environment_steps}
         row |= {name: float(metrics[name].mean()) for name in SHOWN}
         row["kept_tracking"] = float(metrics["survival_weighted_tracking"][self._kept].mean())
-        row["clips"] = clip_means(rollout, self._names)
+        return row | {"clips": clip_means(rollout, self._names)}
+
+    def add(self, row: dict[str, Any]) -> bool:
+        """Write a row and draw all of them again; whether its `kept_tracking` is the best so far."""
         with self._path.open("a") as file:
             file.write(json.dumps(row) + "\n")
         clips_over_time(self._path, self._path.with_suffix(".png"))
@@ -61,12 +64,20 @@ class Watch:
         """Success of every clip over the last evaluations, for the terminal."""
         from rich.table import Table
 
-        rows = read_rows(self._path)[-8:]
-        table = Table(title="success (survival-weighted tracking) by environment steps", title_justify="left", box=None)
-        table.add_column("clip")
-        for row in rows:
-            table.add_column(f"{row['environment_steps'] / 1e6:.1f}M", justify="right")
+        rows = read_rows(self._path)[-6:]
+        table = Table(
+            title="success and survival-weighted tracking by environment steps", title_justify="left", box=None
+        )
+        for column in ("clip", "", *(f"{row['environment_steps'] / 1e6:.1f}M" for row in rows)):
+            table.add_column(column, justify="right" if column.endswith("M") else "left", no_wrap=True)
         for clip in self._names:
-            cells = [row["clips"][clip] for row in rows]
-            table.add_row(clip, *(f"{c['success_rate']:.0%} ({c['survival_weighted_tracking']:.2f})" for c in cells))
+            table.add_row(clip, rows[-1]["clips"][clip].get("state", ""), *(_cell(row, clip) for row in rows))
         return table
+
+
+def _cell(row: dict[str, Any], clip: str) -> str:
+    """Success and tracking of a clip; of a specialist's row, only those of its clip."""
+    if row.get("specialist", clip) != clip:
+        return ""
+    values = row["clips"][clip]
+    return f"{values['success_rate']:.0%} {values['survival_weighted_tracking']:.2f}"

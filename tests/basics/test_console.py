@@ -29,7 +29,7 @@ def test_closing_names_files_and_the_next_command_unbroken():
 
 def test_make_is_answered_with_targets_of_make(monkeypatch):
     monkeypatch.setenv("MAKELEVEL", "1")
-    assert command_line("train", robot="g1", base=None, resume=True) == "make pretrain ROBOT=g1 RESUME=1"
+    assert command_line("train", robot="g1", base=None, resume=True) == "make train ROBOT=g1 RESUME=1"
     assert command_line("motions", "show kick", library=Path("a b")) == "make motions ARGS='show kick' LIBRARY='a b'"
 
 

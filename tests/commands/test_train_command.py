@@ -88,7 +88,7 @@ def test_a_run_survives_ctrl_c_and_kill_9_bit_for_bit(tmp_path, library_folder, 
     said = process.communicate(timeout=60)[1]
     stopped = newest_checkpoint(output)
     assert process.returncode == 130
-    assert said == f"stopped; saved {stopped}; continue with: make pretrain ROBOT=g1 RESUME=1 OUTPUT={output}\n"
+    assert said == f"stopped; saved {stopped}; continue with: make train ROBOT=g1 RESUME=1 OUTPUT={output}\n"
 
     process = start(output, "--resume", "--set", "checkpoint_every=1")
     wait_for(process, output, int(stopped.name) + 3)

@@ -15,6 +15,7 @@ from forgetmimic_jax.ppo.collect import collect, draw_states
 from forgetmimic_jax.ppo.state import TrainState, init_state
 from forgetmimic_jax.ppo.update import make_iteration
 from forgetmimic_jax.tracking.env import Assets, Environment, make_assets, make_environment
+from forgetmimic_jax.tracking.focus import focus_of
 from forgetmimic_jax.tracking.layouts import LAYOUTS
 from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.unlearning.registry import method_of, unlearning_config
@@ -222,7 +223,8 @@ def test_the_base_reads_its_observations_through_its_own_normalisers(run, robot)
     learner, base = policy(1, 0.5), policy(2, 0.3)
     state = dataclasses.replace(state, policy=learner)
     found = run.collect(run.assets, state)
-    anchored = Run(dataclasses.replace(run.env, config=config), dataclasses.replace(run.assets, base=base))
+    focus = focus_of(config.ppo, run.assets.is_target)
+    anchored = Run(dataclasses.replace(run.env, config=config), dataclasses.replace(run.assets, base=base, focus=focus))
     _, metrics = anchored.iterate(anchored.assets, state)
     kept = found.clip == SWAY
     assert 0 < kept.sum() < kept.size

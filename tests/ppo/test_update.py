@@ -21,6 +21,7 @@ from forgetmimic_jax.ppo.transition import Outcome, Transition
 from forgetmimic_jax.ppo.update import improve, learn_normalizers, learn_sampler, make_batch, make_iteration
 from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking.env import Assets, Environment, make_assets
+from forgetmimic_jax.tracking.focus import focus_of
 from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.unlearning.registry import method_of, unlearning_config
 
@@ -224,7 +225,8 @@ class Problem:
 
         def function(state, transition, value, advantage, value_target):
             batch = make_batch(config, self.assets, transition, value, advantage, value_target)
-            state, metrics = improve(config, state, batch, Rule())
+            focus = focus_of(config.ppo, self.assets.is_target)
+            state, metrics = improve(config, focus, state, batch, Rule())
             return learn_normalizers(state, transition), metrics
 
         return jax.jit(function)(self.state, self.transition, self.value, self.advantage, self.value_target)

@@ -244,7 +244,7 @@ def test_a_stop_ends_the_iteration_saves_and_says_how_to_go_on(run, number):
         run()
     assert str(message.value) == (
         f"stopped; saved {run.folder}/checkpoints/00000004; "
-        f"continue with: make pretrain ROBOT=g1 RESUME=1 OUTPUT={run.folder}"
+        f"continue with: make train ROBOT=g1 RESUME=1 OUTPUT={run.folder}"
     )
     assert signal.getsignal(number) is handler
     assert rows(run.folder)[-1]["iteration"] == 4

@@ -97,6 +97,7 @@ def batch() -> Batch:
         is_target=jnp.array([True, True, False, False]),
         weight=full(1.0),
         base=Prediction(full(0.5, JOINTS), full(np.log(0.5), JOINTS), full(3.0)),
+        base_kl=None,
     )
 
 
@@ -124,25 +125,24 @@ def test_a_step_counts_by_its_weight(batch):
     assert loss_of("arft", first, prediction) != pytest.approx(loss_of("arft", batch, prediction), rel=1e-3)
 
 
-def test_the_kl_to_the_base_is_of_kept_steps(batch):
-    """The last two steps are kept, the last of them with three times the other's weight and a mean further off."""
+def test_the_kl_to_the_base_is_of_the_steps_that_have_a_weight_for_it(batch):
+    """The last two steps have one; the last counts three times as much in the loss, and its mean is further off."""
     mean = jnp.array([9.0, 9.0, 0.25, 0.75])[:, None] * jnp.ones(JOINTS)
     batch = dataclasses.replace(batch, weight=jnp.array([1.0, 1.0, 0.5, 1.5]))
     batch = dataclasses.replace(batch, base=batch.base.replace(mean=batch.base.mean.at[3].set(0.0)))
     prediction = Prediction(mean, jnp.full(JOINTS, jnp.log(0.4)), jnp.ones(4))
     near, far = (JOINTS * gaussian_kl(*kl, 0.5) for kl in ((0.25, 0.4, 0.5), (0.75, 0.4, 0.0)))
-    held = dataclasses.replace(CONFIG, ppo=dataclasses.replace(CONFIG.ppo, base_kl=0.3))
-    loss, metrics = ppo_loss(held, batch, prediction)
+    held = dataclasses.replace(batch, base_kl=jnp.array([0.0, 0.0, 0.3, 0.1]))
+    loss, metrics = ppo_loss(CONFIG, held, prediction)
     assert float(metrics["base_kl"]) == pytest.approx(0.25 * near + 0.75 * far, rel=1e-5)
     free, parts = ppo_loss(CONFIG, batch, prediction)
-    assert float(loss - free) == pytest.approx(0.3 * (0.25 * near + 0.75 * far), rel=1e-4)
+    assert float(loss - free) == pytest.approx(0.25 * 0.3 * near + 0.75 * 0.1 * far, rel=1e-4)
     assert "base_kl" not in parts
 
 
 def test_without_a_base_nothing_is_held(batch):
-    held = dataclasses.replace(CONFIG, ppo=dataclasses.replace(CONFIG.ppo, base_kl=0.3))
-    alone = dataclasses.replace(batch, base=None)
-    assert float(ppo_loss(held, alone, now())[0]) == float(ppo_loss(CONFIG, alone, now())[0])
+    alone = dataclasses.replace(batch, base=None, base_kl=jnp.full(4, 0.3))
+    assert float(ppo_loss(CONFIG, alone, now())[0]) == float(ppo_loss(CONFIG, batch, now())[0])
 
 
 def test_gradient_ascent_turns_the_advantage_of_target_steps_round(batch):

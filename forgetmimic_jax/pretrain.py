@@ -1,0 +1,120 @@
+"""Train a base policy in phases, unattended: `forgetmimic pretrain --robot g1`."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from forgetmimic_jax.basics.errors import InputError, run_command
+from forgetmimic_jax.settings.config import Config, EngineName, Preset
+from forgetmimic_jax.settings.options import Settings, check_same, on_engine, override, parse, replace_given
+
+if TYPE_CHECKING:
+    from forgetmimic_jax.tracking.setup import Setup
+
+# What differs from the preset: how long, and how often the curriculum looks, at enough episodes to judge by.
+LENGTH: dict[str, dict[str, Any]] = {
+    "cpu": {"iterations": 7_500, "evaluate_every": 100, "checkpoint_every": 50},
+    "paper": {"iterations": 30_000, "evaluate_every": 500, "checkpoint_every": 500},
+}
+EPISODES = 20  # a clip in an evaluation
+
+
+@dataclass
+class Options:
+    """Train one policy on every clip of a library: all clips, then those that lag, then a specialist for each that is
+    stuck, then one policy of all. Rules decide when. Stop it, or kill it, at any time; --resume continues, and the
+    policy is the same to the last bit."""
+
+    robot: str = "g1"
+    """Robot under robots/."""
+    preset: Preset = "cpu"
+    """Settings to start from: cpu for a laptop, paper for a GPU."""
+    iterations: int | None = None
+    """PPO iterations at most; cpu: 7500 (92 million steps), paper: 30000."""
+    seed: int | None = None
+    """Random seed; 0 by default."""
+    physics: EngineName | None = None
+    """Physics engine; auto is native on a CPU and mjx on a GPU or TPU."""
+    library: Path | None = None
+    """Folder of clips; data/ROBOT by default."""
+    base: Path | None = None
+    """Checkpoint whose policy to start from, another robot's too; none: a random policy. By default the shipped base
+    for a library of your own, and a random policy for the shipped library."""
+    output: Path | None = None
+    """Folder of the run; runs/pretrain-ROBOT by default."""
+    resume: bool = False
+    """Go on from the newest checkpoint in the output folder, with the settings saved there."""
+    set: Settings = field(default_factory=list)
+    """Any other settings, such as pretrain.patience=5."""
+
+
+def main(options: Options) -> None:
+    """Pretrain, and say where the policy is."""
+    from forgetmimic_jax.basics.console import closing, command_line
+    from forgetmimic_jax.tracking.setup import make_setup
+    from forgetmimic_jax.training.folder import BEST, prepare_folder
+    from forgetmimic_jax.training.pretraining import Pretraining
+    from forgetmimic_jax.training.run import run
+
+    output = options.output or Path("runs") / f"pretrain-{options.robot}"
+    prepare_folder(output, resume=options.resume)
+    config = config_of(options, output)
+    setup = make_setup(config)
+    if not options.resume:
+        warn_of_infeasible(setup)
+    path, _ = run(setup, output, description=f"pretrain {config.robot}", resume=options.resume, make_course=Pretraining)
+    best = output / BEST if (output / BEST).is_dir() else path
+    files = {"policy": best, "clips over time": output / "evaluations.png"}
+    files |= {"curves": output / "metrics.jsonl", "TensorBoard": output / "events"}
+    closing(files, command_line("evaluate", robot=config.robot, checkpoint=best, episodes=100))
+
+
+def config_of(options: Options, output: Path) -> Config:
+    """Every setting of the run; with `resume`, of the run in folder `output`.
+
+    Raises:
+        InputError: a flag that contradicts the run to resume, or settings that the phases cannot work with.
+    """
+    from forgetmimic_jax.settings.config import load_config, preset
+    from forgetmimic_jax.training.start import shipped_base
+
+    if options.resume:
+        config = load_config(output / "config.yaml")
+        check_same(options, {name: getattr(config, name) for name in ("robot", "preset", "seed", "library", "base")})
+    else:
+        base = options.base or (shipped_base(options.robot) if options.library else None)
+        base = None if str(base) == "none" else base
+        config = dataclasses.replace(preset(options.preset), **LENGTH[options.preset], evaluate_episodes=EPISODES)
+        config = replace_given(config, robot=options.robot, seed=options.seed, library=options.library, base=base)
+    config = override(replace_given(config, iterations=options.iterations), itertools.chain(*options.set))
+    every, save = config.evaluate_every, config.checkpoint_every
+    if not every or every % save:
+        raise InputError(
+            f"evaluate_every: found {every}; accepted: a multiple of checkpoint_every = {save}, from it on"
+        )
+    if not config.ppo.schedule.startswith("adaptive"):
+        raise InputError(f"ppo.schedule: found {config.ppo.schedule}; accepted: adaptive, adaptive_iteration")
+    return on_engine(config, options.physics)
+
+
+def warn_of_infeasible(setup: Setup) -> None:
+    """Name the clips that no policy may be able to follow, and why, on the terminal."""
+    from rich.console import Console
+
+    from forgetmimic_jax.motion.library import read_library
+    from forgetmimic_jax.motion.quality import measure
+    from forgetmimic_jax.tracking.setup import library_folder
+
+    console = Console(stderr=True)
+    for clip in read_library(setup.robot, library_folder(setup.config)):
+        for reason in measure(setup.robot, clip).infeasibilities():
+            text = f"warning: {clip.name} may be infeasible: {reason}"
+            console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+
+if __name__ == "__main__":
+    run_command(lambda: main(parse(Options, "pretrain")))
