@@ -49,7 +49,7 @@ def main(options: Options) -> None:
     from forgetmimic_jax.ppo.update import make_iteration
     from forgetmimic_jax.settings.config import preset
     from forgetmimic_jax.tracking import env as tracking
-    from forgetmimic_jax.tracking.action import joint_target
+    from forgetmimic_jax.tracking.action import to_joint_target
     from forgetmimic_jax.tracking.setup import make_setup
     from forgetmimic_jax.training.folder import check_writable
     from forgetmimic_jax.training.start import start_state
@@ -84,8 +84,8 @@ def main(options: Options) -> None:
             fresh = tracking.reset_where(env, assets, after, done, reset_key, probabilities, gains)
             observation = tracking.observe(env, assets, fresh, observe_key)
             reference = tracking.lookup(assets.library, episodes.clip, episodes.frame + 1)
-            target = joint_target(config.action.mode, assets.robot, reference, action)
-            return fresh, (episodes.physics, target, observation[0].sum(), result.reward.tracking.sum())
+            joint_target = to_joint_target(config.action.mode, assets.robot, reference, action)
+            return fresh, (episodes.physics, joint_target, observation[0].sum(), result.reward.tracking.sum())
 
         return jax.lax.scan(one_step, episodes, jax.random.split(key, steps))
 
@@ -144,8 +144,8 @@ def _raw_stepping(model, num_envs: int, substeps: int, physics, targets) -> Call
 
     def run() -> float:
         seconds = 0.0
-        for qpos, qvel, warmstart, target in zip(*rows, strict=True):
-            batch.qpos[:], batch.qvel[:], batch.qacc_warmstart[:], batch.ctrl[:] = qpos, qvel, warmstart, target
+        for qpos, qvel, warmstart, joint_target in zip(*rows, strict=True):
+            batch.qpos[:], batch.qvel[:], batch.qacc_warmstart[:], batch.ctrl[:] = qpos, qvel, warmstart, joint_target
             begin = time.perf_counter()
             batch.step(nstep=substeps, stage=int(mujoco.mjtStage.mjSTAGE_VEL))
             seconds += time.perf_counter() - begin

@@ -46,14 +46,14 @@ class Engine(Protocol):
     """Steps and forward kinematics of a batch of robots; pure in the JAX sense."""
 
     def step(
-        self, state: PhysicsState, parameters: PhysicsParameters, target: Array, wrench: Array
+        self, state: PhysicsState, parameters: PhysicsParameters, joint_target: Array, wrench: Array
     ) -> tuple[PhysicsState, BodyState]:
         """One control step.
 
         Args:
             state: state before the step.
             parameters: randomised model values.
-            target: [env, joint] rad, position targets of the PD loops.
+            joint_target: [env, joint] rad, position targets of the PD loops.
             wrench: [env, 6] N and N m in the world frame, on the anchor body at its centre of mass.
 
         Returns:

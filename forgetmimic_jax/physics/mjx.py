@@ -58,14 +58,14 @@ class MjxEngine:
         return int(self._body_data._impl.ncon)
 
     def step(
-        self, state: PhysicsState, parameters: PhysicsParameters, target: Array, wrench: Array
+        self, state: PhysicsState, parameters: PhysicsParameters, joint_target: Array, wrench: Array
     ) -> tuple[PhysicsState, BodyState]:
         """See `Engine.step`."""
         start = self._start(state.qpos.shape[0])
         physics_step = mjx.step if self._implementation == "warp" else _step
 
         def one(
-            state: PhysicsState, parameters: PhysicsParameters, target: Array, wrench: Array
+            state: PhysicsState, parameters: PhysicsParameters, joint_target: Array, wrench: Array
         ) -> tuple[PhysicsState, Array]:
             model = self._model.tree_replace(
                 {
@@ -77,7 +77,7 @@ class MjxEngine:
                 qpos=state.qpos,
                 qvel=state.qvel,
                 qacc_warmstart=state.warmstart,
-                ctrl=target,
+                ctrl=joint_target,
                 xfrc_applied=start.xfrc_applied.at[self._anchor].set(wrench),
             )
             data, _ = jax.lax.scan(lambda d, _: (physics_step(model, d), None), data, length=self._substeps)
@@ -85,7 +85,7 @@ class MjxEngine:
 
         # An accelerator's default precision for products (TF32, bfloat16) would ruin the solver.
         with jax.default_matmul_precision("highest"):
-            state, force = jax.vmap(one)(state, parameters, target, wrench)
+            state, force = jax.vmap(one)(state, parameters, joint_target, wrench)
             return state, self._bodies(state, force)
 
     def forward(self, state: PhysicsState, parameters: PhysicsParameters, mask: Array, bodies: BodyState) -> BodyState:

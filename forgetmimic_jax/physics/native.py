@@ -61,14 +61,15 @@ class NativeEngine:
         self._force_shape = shape(keys, 3)
 
     def step(
-        self, state: PhysicsState, parameters: PhysicsParameters, target: Array, wrench: Array
+        self, state: PhysicsState, parameters: PhysicsParameters, joint_target: Array, wrench: Array
     ) -> tuple[PhysicsState, BodyState]:
         """See `Engine.step`."""
         shapes = (*self._state_shapes, *self._body_shapes, self._force_shape)
+        loaded = (state.qpos, state.qvel, state.warmstart, parameters.foot_friction, parameters.torso_com)
         qpos, qvel, warmstart, xpos, xquat, cvel, com, force = jax.pure_callback(
             self._step_host,
             shapes,
-            (state.qpos, state.qvel, state.warmstart, parameters.foot_friction, parameters.torso_com, target, wrench),
+            (*loaded, joint_target, wrench),
             vmap_method="sequential",
         )
         return PhysicsState(qpos, qvel, warmstart), body_state(xpos, xquat, cvel, com, force)
@@ -102,12 +103,12 @@ class NativeEngine:
         return arrays
 
     def _step_host(self, arguments) -> tuple[np.ndarray, ...]:
-        *loaded, target, wrench = (np.asarray(x) for x in arguments)
+        *loaded, joint_target, wrench = (np.asarray(x) for x in arguments)
         # What overflows float32 has diverged, and shows as infinity: no warning on the user's screen.
         with self._lock, np.errstate(over="ignore"):
             batch = self._batch
             self._load(self._everyone, *loaded)
-            batch.ctrl[:] = target
+            batch.ctrl[:] = joint_target
             batch.xfrc_applied[:, self._anchor] = wrench
             batch.step(nstep=self._substeps, stage=_VELOCITY_STAGE)
             force = -self._outputs["sensordata"][:, self._contact_columns].astype(np.float32)

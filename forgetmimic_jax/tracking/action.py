@@ -1,4 +1,4 @@
-"""What the network's output does: the order of its joints, and the PD targets that it asks for."""
+"""What the network's output does: the order of its joints, and the joint targets that it stands for."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ def in_robot_order(robot: Robot, action: Array) -> Array:
     return action[:, np.argsort(robot.policy_joints)]
 
 
-def joint_target(mode: Literal["residual", "offset"], robot: RobotArrays, reference: Frames, action: Array) -> Array:
-    """PD targets [env, joint] rad: origin + scale · action.
+def to_joint_target(mode: Literal["residual", "offset"], robot: RobotArrays, reference: Frames, action: Array) -> Array:
+    """Joint targets [env, joint] rad of the PD loops: origin + scale · action.
 
     Args:
         mode: the origin: residual, the reference joints; offset, the default pose.

@@ -22,7 +22,7 @@ from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.robot.model import Robot, RobotArrays
 from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking import observation, randomise, reward
-from forgetmimic_jax.tracking.action import in_robot_order, joint_target
+from forgetmimic_jax.tracking.action import in_robot_order, to_joint_target
 from forgetmimic_jax.tracking.focus import Focus, focus_of
 from forgetmimic_jax.tracking.layouts import Layout, Moment, find_layout
 from forgetmimic_jax.tracking.reference import align_to_anchor, anchor_between, lookup
@@ -105,7 +105,7 @@ def make_environment(setup: Setup, num_envs: int, *, noisy: bool | None = None) 
     """An environment of `num_envs` robots; `noisy` defaults to the config's."""
     config, robot = setup.config, setup.robot
     assisted = config.wrench.max_gain > 0
-    physics = dataclasses.replace(config.physics, substeps=1) if assisted else config.physics  # see `_live`
+    physics = dataclasses.replace(config.physics, substeps=1) if assisted else config.physics  # see `_simulate`
     engine = make_engine(robot, physics, num_envs)
     return Environment(config, robot, engine, num_envs, config.noise.enabled if noisy is None else noisy)
 
@@ -197,7 +197,7 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
     reference = lookup(assets.library, state.clip, state.frame + 1)
     action = in_robot_order(robot, action)
     # The joint controller regulates what its encoders read, so their bias moves the robot, not the reading.
-    target = joint_target(config.action.mode, assets.robot, reference, action) - state.encoder_bias
+    joint_target = to_joint_target(config.action.mode, assets.robot, reference, action) - state.encoder_bias
 
     physics, countdown = state.physics, state.push_countdown
     if env.noisy:
@@ -208,7 +208,7 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
         interval = randomise.push_interval(config.noise, interval_key, env.num_envs, env.control_step)
         countdown = jnp.where(due, interval, countdown) - 1
 
-    physics, bodies = _live(env, assets, dataclasses.replace(state, physics=physics), target)
+    physics, bodies = _simulate(env, assets, dataclasses.replace(state, physics=physics), joint_target)
     diverged = ~_all_sane((physics, bodies), env.num_envs)
     # A diverged robot shows as standing where it was, so that no NaN can reach a sum; it is reset right after.
     physics, bodies = (_where(diverged, old, new) for old, new in ((state.physics, physics), (state.bodies, bodies)))
@@ -226,7 +226,7 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
         joint_pos=joint_pos,
         joint_vel=joint_vel,
         joint_acc=physics.warmstart[:, 6:],
-        target=target,
+        joint_target=joint_target,
     )
     # Where, not a product: a number that overflowed before the divergence was seen would survive a factor of zero.
     result_reward = jax.tree.map(
@@ -251,7 +251,7 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
     return new, StepResult(result_reward, terminated, truncated, diverged, causes, pair)
 
 
-def _live(env: Environment, assets: Assets, state: EnvState, target: Array) -> tuple[PhysicsState, BodyState]:
+def _simulate(env: Environment, assets: Assets, state: EnvState, joint_target: Array) -> tuple[PhysicsState, BodyState]:
     """One control step of the physics.
 
     The wrench is renewed for each physics step: before the k-th of n, from 0, the reference is k/n of the way to the
@@ -260,11 +260,11 @@ def _live(env: Environment, assets: Assets, state: EnvState, target: Array) -> t
     """
     if env.config.wrench.max_gain == 0:
         nothing = jnp.zeros((env.num_envs, 6), jnp.float32)
-        return env.engine.step(state.physics, state.parameters, target, nothing)
+        return env.engine.step(state.physics, state.parameters, joint_target, nothing)
 
     def physics_step(state: EnvState, fraction: Array) -> tuple[EnvState, None]:
         wrench = assist(env, assets, state, fraction)
-        physics, bodies = env.engine.step(state.physics, state.parameters, target, wrench)
+        physics, bodies = env.engine.step(state.physics, state.parameters, joint_target, wrench)
         return dataclasses.replace(state, physics=physics, bodies=bodies), None
 
     substeps = env.config.physics.substeps

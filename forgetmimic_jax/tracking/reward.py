@@ -118,7 +118,7 @@ def regularisation_reward(
     joint_pos: Array,
     joint_vel: Array,
     joint_acc: Array,
-    target: Array,
+    joint_target: Array,
 ) -> Array:
     """R_reg [env] (paper, 'Regularization Rewards').
 
@@ -130,9 +130,11 @@ def regularisation_reward(
         joint_pos: [env, joint] rad, after the step.
         joint_vel: [env, joint] rad/s, after the step.
         joint_acc: [env, joint] rad/s².
-        target: [env, joint] rad, the PD target applied.
+        joint_target: [env, joint] rad, of the PD loops in this step.
     """
-    torque = jnp.clip(robot.stiffness * (target - joint_pos) - robot.damping * joint_vel, -robot.effort, robot.effort)
+    torque = jnp.clip(
+        robot.stiffness * (joint_target - joint_pos) - robot.damping * joint_vel, -robot.effort, robot.effort
+    )
     over_limit = jnp.maximum(robot.soft_lower - joint_pos, 0.0) + jnp.maximum(joint_pos - robot.soft_upper, 0.0)
     over_torque = jnp.maximum(jnp.abs(torque) / robot.effort - config.torque_soft_ratio, 0.0)
     return (

@@ -210,7 +210,7 @@ def regularisation(robot, config=RewardConfig(), **changes) -> float:  # noqa: B
     still = jnp.zeros((1, robot.num_joints))
     default = robot.arrays.default_joint_pos[None]
     arguments = dict(
-        action=still, last_action=still, joint_pos=default, joint_vel=still, joint_acc=still, target=default
+        action=still, last_action=still, joint_pos=default, joint_vel=still, joint_acc=still, joint_target=default
     )
     return float(regularisation_reward(robot.arrays, config, **arguments | changes)[0])
 
@@ -237,7 +237,7 @@ def test_joint_limit_costs_the_angle_beyond_nine_tenths_of_the_range(robot, side
     limit = 0.5 * (low + high) + (0.9 if side == "upper" else -0.9) * 0.5 * (high - low)
     beyond = limit + (0.07 if side == "upper" else -0.07)
     joint_pos = robot.arrays.default_joint_pos[None].at[0, knee].set(beyond)
-    assert regularisation(robot, joint_pos=joint_pos, target=joint_pos) == pytest.approx(1.0 - 0.07, abs=1e-5)
+    assert regularisation(robot, joint_pos=joint_pos, joint_target=joint_pos) == pytest.approx(1.0 - 0.07, abs=1e-5)
 
 
 def test_torque_beyond_nine_tenths_costs_its_share_of_the_motors_limit(robot):
@@ -246,7 +246,7 @@ def test_torque_beyond_nine_tenths_costs_its_share_of_the_motors_limit(robot):
     default = robot.arrays.default_joint_pos[None]
 
     def cost(torque: float) -> float:
-        return 1.0 - regularisation(robot, target=default.at[0, knee].add(torque / kp))
+        return 1.0 - regularisation(robot, joint_target=default.at[0, knee].add(torque / kp))
 
     assert cost(0.89 * effort) == pytest.approx(0.0, abs=1e-6)
     assert cost(-0.95 * effort) == pytest.approx(0.1 * 0.05, abs=1e-5)
