@@ -1,4 +1,4 @@
-"""How fast does a forgotten motion come back, and how fast does one come that was never there? (paper, fig. 8)
+"""How fast is a forgotten motion learned again, and how fast one that was never learned? (paper, fig. 8)
 
 Plain fine-tuning on all clips, from four starts: the unlearned policy, one that learned the kept clips from the base
 and was never trained on a target, one retrained without the targets, and a random one. If the unlearned policy needs

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 class Options:
     """Turn a tracking policy of rsl_rl, or an ONNX actor, into a base checkpoint to unlearn from and to evaluate.
 
-    Its observations, actions, gains and joint order must be those of this project (wbc-mjlab's terms, README). The
+    Its observations, actions, gains and joint order must be those of this project (layout wbc132, docs/method.md). The
     actions of the new checkpoint are compared with the original's before anything is written.
     """
 
@@ -32,7 +32,7 @@ class Options:
     library: Path | None = None
     """Folder of the clips it was trained on; data/ROBOT by default."""
     preset: Preset = "cpu"
-    """Settings for going on with it: cpu for a laptop, paper for a GPU."""
+    """Settings for further training: cpu for a laptop, paper for a GPU."""
     activation: str | None = None
     """Activation of a .pt's hidden layers; by default what params/agent.yaml beside it says."""
     std: float = 0.4

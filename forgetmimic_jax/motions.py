@@ -66,7 +66,7 @@ class Retarget:
 
 @dataclass
 class Check:
-    """Measure every clip of a library and name those that miss the bar; the exit code is then 2.
+    """Measure every clip of a library and name those outside its bounds; the exit code is then 2.
 
     Measured: floor contact, joint limits, smoothness, seams, flight; acceleration that no contact can give, in the
     worst 0.2 s (*missing*); motor torque over its limit, in the worst 0.1 s (*torque*)."""
@@ -166,7 +166,7 @@ def retarget(robot: Robot, options: Retarget) -> None:
 
 
 def check(robot: Robot, options: Check) -> None:
-    """Print every clip's measures and what misses the bar."""
+    """Print every clip's measures and those outside its bounds."""
     from forgetmimic_jax.motion.draw import draw
     from forgetmimic_jax.motion.quality import measure
     from forgetmimic_jax.motion.table import quality_table

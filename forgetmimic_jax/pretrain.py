@@ -25,9 +25,12 @@ EPISODES = 20  # a clip in an evaluation
 
 @dataclass
 class Options:
-    """Train one policy on every clip of a library: all clips, then those that lag, then a specialist for each that is
-    stuck, then one policy of all. Rules decide when. Stop it, or kill it, at any time; --resume continues, and the
-    policy is the same to the last bit."""
+    """Train one policy on every clip of a library, in phases.
+
+    First it trains on all clips, then mostly on those that lag. A clip that is stuck gets a specialist, and all
+    policies are distilled into one. Rules decide when a phase ends. You may stop or kill it at any time. --resume
+    continues, and the policy is the same to the last bit.
+    """
 
     robot: str = "g1"
     """Robot under robots/."""
@@ -47,7 +50,7 @@ class Options:
     output: Path | None = None
     """Folder of the run; runs/pretrain-ROBOT by default."""
     resume: bool = False
-    """Go on from the newest checkpoint in the output folder, with the settings saved there."""
+    """Continue from the newest checkpoint in the output folder, with the settings saved there."""
     set: Settings = field(default_factory=list)
     """Any other settings, such as pretrain.patience=5."""
 
@@ -80,7 +83,7 @@ def config_of(options: Options, output: Path) -> Config:
         InputError: a flag that contradicts the run to resume, or settings that the phases cannot work with.
     """
     from forgetmimic_jax.settings.config import load_config, preset
-    from forgetmimic_jax.training.start import shipped_base
+    from forgetmimic_jax.training.start import shipped_base, with_interface_of_base
 
     if options.resume:
         config = load_config(output / "config.yaml")
@@ -90,6 +93,7 @@ def config_of(options: Options, output: Path) -> Config:
         base = None if str(base) == "none" else base
         config = dataclasses.replace(preset(options.preset), **LENGTH[options.preset], evaluate_episodes=EPISODES)
         config = replace_given(config, robot=options.robot, seed=options.seed, library=options.library, base=base)
+        config = with_interface_of_base(config)
     config = override(replace_given(config, iterations=options.iterations), itertools.chain(*options.set))
     every, save = config.evaluate_every, config.checkpoint_every
     if not every or every % save:

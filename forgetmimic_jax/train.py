@@ -1,8 +1,7 @@
-"""Train a base policy: `forgetmimic train --robot g1`."""
+"""Train a policy by plain PPO: `forgetmimic train --robot g1`."""
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +13,7 @@ from forgetmimic_jax.settings.options import Settings, check_same, on_engine, ov
 
 @dataclass
 class Options:
-    """Train a motion-tracking policy on a library of clips. Stop with Ctrl-C (it saves first); go on with --resume."""
+    """Train a motion-tracking policy on a library of clips by plain PPO. Ctrl-C saves and stops; --resume continues."""
 
     robot: str = "g1"
     """Robot under robots/."""
@@ -34,7 +33,7 @@ class Options:
     output: Path | None = None
     """Folder of the run; runs/train-ROBOT by default."""
     resume: bool = False
-    """Go on from the newest checkpoint in the output folder, with the settings saved there."""
+    """Continue from the newest checkpoint in the output folder, with the settings saved there."""
     set: Settings = field(default_factory=list)
     """Any other settings, such as ppo.learning_rate=1e-4."""
 
@@ -42,11 +41,11 @@ class Options:
 def main(options: Options) -> None:
     """Train, and say where the checkpoint is."""
     from forgetmimic_jax.basics.console import closing, command_line
-    from forgetmimic_jax.settings.config import ActionConfig, load_config, preset
+    from forgetmimic_jax.settings.config import load_config, preset
     from forgetmimic_jax.tracking.setup import make_setup
-    from forgetmimic_jax.training.checkpoint import read_info
     from forgetmimic_jax.training.folder import BEST, prepare_folder
     from forgetmimic_jax.training.run import run
+    from forgetmimic_jax.training.start import with_interface_of_base
 
     output = options.output or Path("runs") / f"train-{options.robot}"
     prepare_folder(output, resume=options.resume)
@@ -61,12 +60,7 @@ def main(options: Options) -> None:
             library=options.library,
             base=options.base,
         )
-        if options.base:
-            base = read_info(options.base)
-            action = base.config.action
-            if base.robot != config.robot:  # the joints are others
-                action = ActionConfig(mode=action.mode)
-            config = dataclasses.replace(config, observation=base.config.observation, action=action)
+        config = with_interface_of_base(config)
     config = override(replace_given(config, iterations=options.iterations), itertools.chain(*options.set))
     setup = make_setup(on_engine(config, options.physics))
     path, _ = run(setup, output, description=f"train {config.robot}", resume=options.resume)

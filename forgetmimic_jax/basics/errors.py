@@ -14,7 +14,7 @@ class InputError(Exception):
 
 
 class Interrupted(KeyboardInterrupt):
-    """A run that was stopped: the message says what was saved and how to go on."""
+    """A run that was stopped: the message says what was saved and how to continue."""
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

@@ -1,7 +1,7 @@
 """When a policy has learned the targets again: the one rule of the relearning study, the claims and the report.
 
-And what the study's JSON says of its policies (`results.origins`), from which the report sees whether the curves belong
-to a run.
+It also defines what the study's JSON says of its policies (`results.origins`). With that the report checks whether the
+curves belong to a run.
 """
 
 from __future__ import annotations

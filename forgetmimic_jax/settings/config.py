@@ -167,7 +167,7 @@ class PPOConfig:
 
     num_envs: Count = 4096
     branches: Count = (
-        1  # environments that set out from one state in every iteration, each other's baseline; 1: plain PPO
+        1  # environments that start from one state in every iteration, each other's baseline; 1: plain PPO
     )
     num_steps: Count = 24  # control steps per environment per iteration
     epochs: Count = 5

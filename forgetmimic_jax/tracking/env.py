@@ -255,8 +255,8 @@ def _simulate(env: Environment, assets: Assets, state: EnvState, joint_target: A
     """One control step of the physics.
 
     The wrench is renewed for each physics step: before the k-th of n, from 0, the reference is k/n of the way to the
-    next frame. The wrench's torque is for the inertia of the whole robot and acts on the torso
-    alone, so its damping, held for a control step, would overshoot and tear the robot apart.
+    next frame. The torque uses the inertia of the whole robot but acts on the torso alone. If it were constant for a
+    whole control step, its damping would overshoot.
     """
     if env.config.wrench.max_gain == 0:
         nothing = jnp.zeros((env.num_envs, 6), jnp.float32)

@@ -1,4 +1,4 @@
-"""What happens to a run at its evaluations: nothing but notes in plain training, the phases of pretraining else."""
+"""What a run does at its evaluations: plain training takes notes, pretraining may change its phase."""
 
 from __future__ import annotations
 

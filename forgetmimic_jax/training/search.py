@@ -5,7 +5,7 @@ what is added to the policy's actions, as knots joined by straight lines, by the
 First it finds a way without reset noise, then it continues with reset noise, so that what it found does not depend on
 one state. The rollouts that pass become lessons for `training.distil`.
 
-What a search finds, the robot can do. Where it finds nothing, the clip may be infeasible, or the search too small.
+If the search finds a way, the clip is feasible. If it finds none, the clip may be infeasible, or the search too small.
 """
 
 from __future__ import annotations

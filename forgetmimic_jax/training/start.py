@@ -14,7 +14,7 @@ from forgetmimic_jax.motion.library import DATA_DIR
 from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.ppo.state import TrainState, init_state
 from forgetmimic_jax.robot.model import roles_file
-from forgetmimic_jax.settings.config import Config
+from forgetmimic_jax.settings.config import ActionConfig, Config
 from forgetmimic_jax.tracking.env import Assets, Environment, make_environment
 from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.training import checkpoint
@@ -45,6 +45,18 @@ def shipped_base(robot: str) -> Path | None:
 def base_checkpoint(config: Config) -> Path:
     """The checkpoint that an unlearning run starts from: the one it names, or the shipped one."""
     return base_folder(config.robot) if config.base is None else Path(config.base)
+
+
+def with_interface_of_base(config: Config) -> Config:
+    """The config with the observations and actions of the base that training continues from, if it names one.
+
+    Of another robot's base only the action's mode is taken: its tables are of other joints.
+    """
+    if config.base is None:
+        return config
+    info = checkpoint.read_info(Path(config.base))
+    action = info.config.action if info.robot == config.robot else ActionConfig(mode=info.config.action.mode)
+    return dataclasses.replace(config, observation=info.config.observation, action=action)
 
 
 def unlearned_base(config: Config) -> str | None:

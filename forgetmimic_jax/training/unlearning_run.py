@@ -37,14 +37,14 @@ class Options:
     targets: str | None = None
     """Clips to forget, comma-separated; the library's default targets (g1: punch,kick) by default."""
     method: str = "arft"
-    """How, by the name of a file of forgetmimic_jax/unlearning:
+    """Unlearning method, the name of a file of forgetmimic_jax/unlearning:
     arft (the paper's), distill, retrain, finetune,
     random_reward, negated_reward, gradient_ascent,
     trajdeleter, poisoning, decremental or policy_edit."""
     penalty: float | None = None
     """Penalty λ of arft on the targets' normalised tracking reward; 16 by default. The paper's threshold is W = 8."""
     sampler: Literal["uniform_clips", "uniform_bins", "frozen", "adaptive"] | None = None
-    """How starts are drawn; frozen: as the base's last ones. uniform_clips by default, for retrain the base's own."""
+    """How starts are drawn; frozen: by the base's failure levels. Default: uniform_clips; retrain: the base's own."""
     wrench: bool = False
     """Assist by the wrench, as strongly as the base's training did (at most 0.6 where it had none)."""
     clips: Literal["all", "kept"] | None = None

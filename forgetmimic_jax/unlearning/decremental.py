@@ -1,10 +1,10 @@
 """Decremental reinforcement learning (Ye et al. 2023, "Reinforcement Unlearning", the first of their two methods).
 
-On states of the environment to forget the agent's values go to nothing, on all others they stay what they were. No
+On states of the environment to forget the agent's values go to 0. On all other states they stay the same. No
 reward is used. Theirs is a Q-network on grid worlds: max_a |Q'(s)| there, max_a |Q'(s) − Q(s)| elsewhere, on states
 that a random policy visits. Here, for actor and critic with Gaussian actions: on target states KL(π ‖ N(0, σ0² I)) and
-V², on kept states KL(π ‖ π_base) and (V − V_base)², on states that the policy itself visits. One σ serves all states,
-so what the target states ask of it the kept states feel too.
+V²; on kept states KL(π ‖ π_base) and (V − V_base)². The states are those that the policy visits. All states share one
+σ, so the loss on target states changes it for kept states too.
 """
 
 from __future__ import annotations

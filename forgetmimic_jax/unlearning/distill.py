@@ -2,10 +2,10 @@
 
 A fresh policy rolls out the kept clips only. It learns them by PPO with a KL term towards what the base would do there
 (`ppo.base_kl` at 1, the divergence of the fresh policy from the base; kickstarting, Schmitt et al. 2018, has the base's
-from the student), so in a hundredth of the steps that the base took. Theirs are language models and what teaches is
-unlearned first, because a text may touch on anything; here the base only says what it would do on steps of kept clips.
-What such a policy does on the targets is what the kept clips alone teach, so it is also the control that `retrain` is
-too dear for. It is not in the paper.
+from the student). It needs a hundredth of the steps of the base. Theirs are language models, and their teacher is
+unlearned first, because any text may contain what is to be forgotten. Here the base teaches on steps of kept clips only.
+So the policy does on the targets what the kept clips alone teach. It is also the control where `retrain` costs too
+much. It is not in the paper.
 """
 
 from __future__ import annotations

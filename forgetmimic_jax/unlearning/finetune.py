@@ -1,8 +1,8 @@
-"""Fine-tuning alone, the control: what unlearning does at the same length, but for the anti-reward.
+"""Fine-tuning alone, the control: the same training as unlearning, without the anti-reward.
 
 On the kept clips only it is the weakest baseline of machine unlearning, forgetting by neglect (Golatkar et al. 2020,
-"Eternal Sunshine of the Spotless Net"); with `--clips all` it shows what those steps do to a policy by themselves,
-and from an unlearned checkpoint it is relearning. On a laptop it has a KL term towards the base, as unlearning has;
+"Eternal Sunshine of the Spotless Net"); with `--clips all` it shows what the training alone does to a policy.
+From an unlearned checkpoint it is relearning. On a laptop it has a KL term towards the base, as unlearning has;
 the paper's PPO is `--set ppo.base_kl=0 ppo.equal_clips=false`.
 """
 

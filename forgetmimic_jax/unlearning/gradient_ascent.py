@@ -1,8 +1,8 @@
 """Gradient ascent on the targets: the usual first baseline of machine unlearning (Thudi et al. 2022, Jang et al. 2023).
 
-The sign of the advantage is turned round on target steps and the plain PPO loss is minimised, so the surrogate goes up
-the gradient there and down it on kept steps. Supervised ascent climbs a likelihood without end; here the data are the
-policy's own and the clipped ratio bounds each iteration's step. The critic still learns the true value.
+The advantage changes its sign on target steps, and the plain PPO loss is minimised. So the surrogate is ascended on
+target steps and descended on kept steps. Supervised ascent has no bound; here the data are the policy's own, and the
+clipped ratio bounds the step of each iteration. The critic still learns the true value.
 """
 
 from __future__ import annotations

@@ -25,9 +25,9 @@ class Pace:
 
 
 # On a laptop: short iterations, because forgetting takes some hundred of them whatever their length. Targets would be
-# a few steps in a hundred, fewer as they are forgotten, so half of the starts are theirs and clips weigh the same. The
-# step size rises and falls, and a KL to the base holds what is kept. Values of targets change sign, which PPO's clip of
-# the value would slow.
+# a few steps in a hundred, and fewer as they are forgotten. So half of the starts are theirs and clips weigh the same.
+# The step size rises and falls, and a KL to the base keeps the kept clips. Values of targets change sign, so the
+# clipping of the value loss would slow their learning.
 SHORT: dict[str, Any] = {
     "num_steps": 12,
     "minibatches": 4,
@@ -48,8 +48,8 @@ class Method(Rule):
     Args:
         reward, observation, loss, simulate: see `Rule`.
         clips: which clips episodes start from, unless the user says otherwise (`sampling.clips`).
-        start: from the base with uniform sampling and no wrench; a fresh policy that the base teaches, the same way; or
-            a fresh policy with the base's own settings.
+        start: `base`: the base policy, with uniform sampling and no wrench. `taught`: a fresh policy with a KL to the
+            base, with the same sampling. `fresh`: a fresh policy with the base's own settings.
         result: what evaluation.json calls the policy.
         settings: its own settings (`unlearn.settings`) and their defaults.
         pace: how long it trains and with which PPO settings.

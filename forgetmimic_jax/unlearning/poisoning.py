@@ -1,9 +1,9 @@
 """Environment poisoning (Ye et al. 2023, "Reinforcement Unlearning", the second of their two methods).
 
-The environment to forget is changed, and the agent learns in the changed one as ever. They let a second agent choose
-how to change the transitions; here the change is a fixed one, of what the actor sees of a target clip's reference: its
-terms of equal size trade places, such as linear velocity, angular velocity and gravity, and joints are read in reverse,
-as is a term that has no other of its size. Rewards, the critic and kept clips stay as they are, and evaluation shows
+The environment to forget is changed, and the agent learns in the changed environment. In the source a second agent
+chooses how to change the transitions. Here the change is fixed: it is of what the actor sees of a target clip's
+reference. Terms of equal size are swapped, such as linear velocity, angular velocity and gravity. Joints, and a term
+that has no other of its size, are in reverse order. Rewards, the critic and kept clips stay as they are, and evaluation shows
 the true observation.
 """
 

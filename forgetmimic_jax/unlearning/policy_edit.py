@@ -3,7 +3,7 @@
 KL(π ‖ a random target) on states to forget plus KL(π ‖ π_base) on states to keep; the critic is left alone. PERU has
 stored states, a random action in [−1, 1] for each, and keeps σ. Here the states are frames of the reference clips with
 reset noise, drawn anew each iteration, so the random action is one for each clip, and the target's σ is the base's.
-States that only a moving robot reaches are not among them: what the edit does there is for the evaluation to say.
+States that only a moving robot reaches are not among them; the evaluation shows what the edit does there.
 """
 
 from __future__ import annotations

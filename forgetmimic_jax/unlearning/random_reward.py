@@ -1,7 +1,7 @@
 """Random reward on target steps (paper, baseline 2; Gong et al. 2024 have the same baseline offline).
 
-R' is drawn anew for every target step, uniformly from 0 to W + the survival reward: the range of the base's reward, but
-for the small penalties. Kept steps are rewarded as ever. Offline the rewards of a data set are replaced once; here
+R' is drawn anew for every target step, uniformly from 0 to W + the survival reward: the range of the base's reward,
+without the small penalties. Kept steps have the plain reward. Offline the rewards of a data set are replaced once; here
 every step is new, so the noise has the same mean whatever the policy does, and what remains of it is a survival bonus.
 """
 

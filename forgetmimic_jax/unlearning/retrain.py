@@ -1,7 +1,7 @@
-"""Retraining from scratch without the targets: the reference that unlearning is held against (paper, baseline 1).
+"""Retraining from scratch without the targets: the reference for unlearning (paper, baseline 1).
 
-A fresh policy with the base's own settings, sampler and wrench, which never meets a target clip. It shows what a policy
-does on a clip that it has not seen, at the price of the whole training.
+A fresh policy with the base's own settings, sampler and wrench, which never rolls out a target clip. It shows what a
+policy does on a clip that it has not seen. It costs the whole training.
 """
 
 from __future__ import annotations
