@@ -3,9 +3,9 @@
 A fresh policy rolls out the kept clips only. It learns them by PPO with a KL term towards what the base would do there
 (`ppo.base_kl` at 1, the divergence of the fresh policy from the base; kickstarting, Schmitt et al. 2018, has the base's
 from the student). It needs a hundredth of the steps of the base. Theirs are language models, and their teacher is
-unlearned first, because any text may contain what is to be forgotten. Here the base teaches on steps of kept clips only.
-So the policy does on the targets what the kept clips alone teach. It is also the control where `retrain` costs too
-much. It is not in the paper.
+unlearned first, because any text may contain what is to be forgotten. Here the base teaches on steps of kept clips
+only. So the policy does on the targets what the kept clips alone teach. It is also the control where `retrain` costs
+too much. It is not in the paper.
 """
 
 from __future__ import annotations

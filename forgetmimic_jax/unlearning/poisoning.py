@@ -3,8 +3,8 @@
 The environment to forget is changed, and the agent learns in the changed environment. In the source a second agent
 chooses how to change the transitions. Here the change is fixed: it is of what the actor sees of a target clip's
 reference. Terms of equal size are swapped, such as linear velocity, angular velocity and gravity. Joints, and a term
-that has no other of its size, are in reverse order. Rewards, the critic and kept clips stay as they are, and evaluation shows
-the true observation.
+that has no other of its size, are in reverse order. Rewards, the critic and kept clips stay as they are.
+Evaluation shows the true observation.
 """
 
 from __future__ import annotations
