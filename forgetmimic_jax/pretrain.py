@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 # What differs from the preset: how long, and how often the curriculum looks, at enough episodes to judge by.
 LENGTH: dict[str, dict[str, Any]] = {
-    "cpu": {"iterations": 7_500, "evaluate_every": 100, "checkpoint_every": 50},
+    "cpu": {"iterations": 7_200, "evaluate_every": 100, "checkpoint_every": 50},
     "paper": {"iterations": 30_000, "evaluate_every": 500, "checkpoint_every": 500},
 }
 EPISODES = 20  # a clip in an evaluation
@@ -37,7 +37,7 @@ class Options:
     preset: Preset = "cpu"
     """Settings to start from: cpu for a laptop, paper for a GPU."""
     iterations: int | None = None
-    """PPO iterations at most; cpu: 7500 (92 million steps), paper: 30000."""
+    """PPO iterations at most; cpu: 7200 (88 million steps), paper: 30000."""
     seed: int | None = None
     """Random seed; 0 by default."""
     physics: EngineName | None = None

@@ -269,5 +269,26 @@ def test_a_runs_clips_are_drawn_over_its_environment_steps(tmp_path, monkeypatch
     evaluations.write_text("".join(json.dumps(row) + "\n" for row in rows))
     plots.clips_over_time(evaluations, tmp_path / "evaluations.png")
     panels = {axes.get_title(): [line.get_xydata().tolist() for line in axes.lines] for axes in drawn[0].axes}
-    assert panels["walk"] == [[[1, 0], [2, 0.5], [3, 1.0]], [[1, 0], [2, 0.25], [3, 0.5]]]
+    assert panels["walk"] == [[[1, 0], [2, 0.5], [3, 1.0]], [], [[1, 0], [2, 0.25], [3, 0.5]], []]
     assert panels["spin"][0] == [[1, 0], [2, 0.25], [3, 0.5]]
+
+
+def test_a_pretrained_clip_has_its_state_and_its_specialist_apart(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(plots, "save", lambda figure, path: drawn.append(figure))
+
+    def row(millions: int, success: float, state: str, **more: str) -> dict:
+        of = {"success_rate": success, "survival_weighted_tracking": 0.5 * success, "state": state}
+        return {"environment_steps": 1_000_000 * millions, "clips": {"walk": of, "spin": of}, **more}
+
+    rows = [row(1, 0.2, "learning"), row(2, 0.6, "stuck", specialist="spin"), row(4, 0.8, "mastered")]
+    evaluations = tmp_path / "evaluations.jsonl"
+    evaluations.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    plots.clips_over_time(evaluations, tmp_path / "evaluations.png")
+    panels = {axes.get_title(): axes for axes in drawn[0].axes}
+    lines = {title: [line.get_xydata().tolist() for line in axes.lines] for title, axes in panels.items()}
+    assert lines["walk · mastered"] == [[[1, 0.2], [4, 0.8]], [], [[1, 0.1], [4, 0.4]], []]
+    assert lines["spin · mastered"] == [[[1, 0.2], [4, 0.8]], [[2, 0.6]], [[1, 0.1], [4, 0.4]], [[2, 0.3]]]
+    spans = [(patch.get_x(), patch.get_width()) for patch in panels["walk · mastered"].patches]
+    assert spans == [(0, 1), (1, 1), (2, 2)]
+    assert len({patch.get_facecolor() for patch in panels["walk · mastered"].patches}) == 3

@@ -92,6 +92,16 @@ def test_the_targets_get_their_share_and_each_side_keeps_the_rules_proportions(r
     np.testing.assert_allclose(shared[1], 0.3 * plain[1] / plain[1].sum(), rtol=1e-5)
 
 
+@pytest.mark.parametrize("rule", RULES)
+def test_with_given_starts_the_rule_decides_among_a_clips_bins_alone(rule):
+    bins = bins_of([11, 21, 16], 10)
+    level = jnp.array([[0.5, 0.9], [0.0, 1.0], [0.3, 0.6]])
+    plain = np.asarray(bin_probabilities(SamplingConfig(rule=rule), bins, level))
+    given = np.asarray(bin_probabilities(SamplingConfig(rule=rule), bins, level, starts=jnp.array([0.5, 0.0, 0.5])))
+    np.testing.assert_allclose(given.sum(-1), [0.5, 0.0, 0.5], rtol=1e-6)
+    np.testing.assert_allclose(given[[0, 2]], 0.5 * plain[[0, 2]] / plain[[0, 2]].sum(-1, keepdims=True), rtol=1e-5)
+
+
 def test_uniform_bins_gives_every_bin_the_same():
     bins = bins_of([11, 21], 10)
     expected = np.array([[1, 0], [1, 1]]) / 3.0

@@ -30,3 +30,15 @@ def test_a_row_is_the_mean_of_the_iterations_that_have_a_number_and_leaves_out_w
     assert found[12]["target/lambda_crit"] == 12.0  # of 12 alone, without 11
     assert found[10]["entropy"] == 6.0  # of 2 to 10
     assert not any("kept/lambda_crit" in row for row in found.values())
+
+
+def test_a_note_joins_the_row_and_its_clips(tmp_path):
+    metrics = {"clip/steps": np.array([6.0, 2.0]), "clip/probability": np.array([0.5, 0.5])}
+    note = {"phase": "lagging", "clips": {"walk": {"state": "mastered"}, "kick": {"state": "new"}}}
+    with Log(tmp_path, 0, 0) as log:
+        log.add(metrics)
+        log.write(1, 8, ("walk", "kick"), note)
+    (row,) = read_rows(tmp_path / "metrics.jsonl")
+    assert row["phase"] == "lagging"
+    assert row["clips"]["walk"] == {"state": "mastered", "probability": 0.5, "step_share": 0.75}
+    assert row["clips"]["kick"] == {"state": "new", "probability": 0.5, "step_share": 0.25}

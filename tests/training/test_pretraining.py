@@ -101,7 +101,7 @@ def pretrain(setup) -> Callable[..., Path]:
                 patch.setattr(checkpoint, name, counted(name, getattr(checkpoint, name)))
             return run_module.run(setup, folder, description="pretrain", resume=resume, make_course=Pretraining)[0]
 
-    pretrain.results = results
+    pretrain.results, pretrain.made = results, made
     return pretrain
 
 
@@ -157,6 +157,10 @@ def test_a_specialist_sees_its_clip_alone_and_lagging_clips_get_most(unbroken):
     assert [rows[12][name]["step_share"] for name in NAMES] == [0.0, 1.0, 0.0]
     assert [rows[14][name]["probability"] for name in NAMES] == [0.0, 0.0, 1.0]
     assert rows[7]["sway"]["probability"] == pytest.approx(0.25, abs=1e-4)
+
+
+def test_no_phase_compiles_the_iteration_again(pretrain, unbroken):
+    assert pretrain.made["iteration"]._cache_size() == 1
 
 
 def test_policies_that_nothing_needs_are_removed(unbroken):

@@ -1,0 +1,60 @@
+"""The command around pretraining: its settings, and what it says before it trains."""
+
+import dataclasses
+from pathlib import Path
+
+from miniature import TINY
+
+from forgetmimic_jax import pretrain
+from forgetmimic_jax.motion import quality
+from forgetmimic_jax.motion.library import DATA_DIR
+from forgetmimic_jax.settings.config import preset
+from forgetmimic_jax.tracking.setup import make_setup
+
+PHASES = [*TINY, "evaluate_every=4"]
+
+
+def config_of(**given):
+    return pretrain.config_of(pretrain.Options(**given), Path("run"))
+
+
+def test_a_base_from_nothing_in_at_most_120_million_steps():
+    config = config_of()
+    assert (config.base, config.library, config.robot) == (None, None, "g1")
+    assert config.iterations * config.ppo.num_envs * config.ppo.num_steps == 88_473_600
+    assert (config.evaluate_every, config.checkpoint_every, config.evaluate_episodes) == (100, 50, 20)
+    assert config.ppo == preset("cpu").ppo
+
+
+def test_a_library_of_ones_own_starts_from_the_shipped_base(library_folder):
+    assert config_of(library=library_folder).base == str(DATA_DIR / "g1" / "base")
+    assert config_of(library=library_folder, base=Path("none")).base is None
+    assert config_of(library=library_folder, base=Path("mine")).base == "mine"
+
+
+def test_what_the_phases_cannot_work_with_is_told_in_one_line(refused, library_folder):
+    def told(*settings: str) -> str:
+        options = pretrain.Options(library=library_folder, base=Path("none"), set=[[*PHASES, *settings]])
+        return refused(pretrain.main, options)
+
+    every = "accepted: a multiple of checkpoint_every = 2, from it on"
+    assert told("evaluate_every=0") == f"evaluate_every: found 0; {every}"
+    assert told("evaluate_every=3") == f"evaluate_every: found 3; {every}"
+    assert told("ppo.schedule=fixed") == "ppo.schedule: found fixed; accepted: adaptive, adaptive_iteration"
+    assert told("pretrain.patience=0") == "--set: pretrain.patience: found 0; accepted: a whole number from 1"
+
+
+def test_an_infeasible_clip_is_named_with_its_numbers(library_folder, monkeypatch, capsys):
+    measured = quality.measure
+
+    def worse(robot, clip):
+        found = measured(robot, clip)
+        return dataclasses.replace(found, missing_acceleration=9.5, motor_load=2.93) if clip.name == "nod" else found
+
+    monkeypatch.setattr(quality, "measure", worse)
+    setup = make_setup(dataclasses.replace(preset("cpu"), library=str(library_folder)))
+    pretrain.warn_of_infeasible(setup)
+    assert capsys.readouterr().err.splitlines() == [
+        "warning: nod may be infeasible: for 0.2 s it needs 9.5 m/s^2 that no contact gives",
+        "warning: nod may be infeasible: for 0.1 s it needs 2.93 times a motor's torque limit",
+    ]
