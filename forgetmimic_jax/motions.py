@@ -183,7 +183,7 @@ def check(robot: Robot, options: Check) -> None:
     closing(files, _train(robot, folder))
     failed = [quality.name for quality in measures if quality.failures()]
     if failed:
-        raise InputError(f"{folder}: {len(failed)} of {len(clips)} clips miss the bar: {', '.join(failed)}")
+        raise InputError(f"{folder}: {len(failed)} of {len(clips)} clips are outside their bounds: {', '.join(failed)}")
 
 
 def show(robot: Robot, options: Show) -> None:

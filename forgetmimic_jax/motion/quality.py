@@ -55,7 +55,7 @@ class Quality:
     motor_load: float | None  # torque over torque limit, the worst mean over LOAD_SECONDS of a motor that counts
 
     def failures(self) -> list[str]:
-        """What misses the bar, in words; empty where the clip passes."""
+        """Which measures are outside their bounds, in words; empty where the clip passes."""
         checks = [
             (self.limit_excess > 1e-4, f"a joint {self.limit_excess:.3f} rad beyond its limit"),
             (self.joint_speed > 1.0, f"a joint at {self.joint_speed:.2f} of its motor's speed"),

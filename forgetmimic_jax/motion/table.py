@@ -1,4 +1,4 @@
-"""The measures of clips as a table for the terminal, and what misses the bar."""
+"""The measures of clips as a table for the terminal, and what is outside its bounds."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ COLUMNS = {
 
 
 def quality_table(measures: Sequence[Quality], entries: Mapping[str, Any]) -> str:
-    """One line a clip, then what misses the bar, one a line.
+    """One line a clip, then what is outside its bounds, one a line.
 
     A retargeted clip's mean angle to the human's limbs, from its entry of the manifest, is the last column.
     """
