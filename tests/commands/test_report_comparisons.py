@@ -1,6 +1,5 @@
 """What a report accepts to compare a run with, what it refuses, and what it counts as not measured."""
 
-import dataclasses
 import json
 import shutil
 from collections.abc import Callable
@@ -15,7 +14,8 @@ from miniature import finished
 from experiments.relearning import origins
 from forgetmimic_jax import report
 from forgetmimic_jax.evaluation.relearning import comparable_settings
-from forgetmimic_jax.settings.config import load_config, save_config
+from forgetmimic_jax.settings.checked import from_dict
+from forgetmimic_jax.settings.config import Config, load_config, save_config, to_dict
 from forgetmimic_jax.training.checkpoint import policy_hash, read_info
 
 METRICS = ("tracking_reward", "survival_weighted_tracking", "success_rate", "episode_length")
@@ -57,6 +57,7 @@ def make_control(run, document, tmp_path) -> Callable[..., Path]:
         folder = tmp_path / "control"
         folder.mkdir(exist_ok=True)
         settings = {"unlearn.method": "distill", "sampling.clips": "kept", "sampling.target_share": 0.0}
+        settings |= {"unlearn.settings": {}}  # the penalty is arft's
         save_config(changed(load_config(run / "config.yaml"), settings | (config or {})), folder / "config.yaml")
         policy = skilled(document["policies"]["unlearned"], target=0.1, kept=kept)
         result = {"distill": "unlearned", "retrain": "retrained"}.get((config or {}).get("unlearn.method"), "unlearned")
@@ -67,17 +68,16 @@ def make_control(run, document, tmp_path) -> Callable[..., Path]:
     return make_control
 
 
-def changed(config: Any, settings: dict[str, Any]) -> Any:
+def changed(config: Config, settings: dict[str, Any]) -> Config:
     """A config with other values by their dotted names."""
+    content = to_dict(config)
     for name, value in settings.items():
-        section, _, field = name.rpartition(".")
-        if section:
-            config = dataclasses.replace(
-                config, **{section: dataclasses.replace(getattr(config, section), **{field: value})}
-            )
-        else:
-            config = dataclasses.replace(config, **{field: value})
-    return config
+        *sections, field = name.split(".")
+        table = content
+        for section in sections:
+            table = table[section]
+        table[field] = value
+    return from_dict(Config, content)
 
 
 def curve(steps: float) -> dict:
