@@ -71,11 +71,11 @@ class ActionConfig:
 
     mode: Literal["residual", "offset"] = "residual"  # added to the reference joints, or to the default pose
     joint_order: tuple[str, ...] = ()  # of the actor's inputs and outputs
-    default_pose: dict[str, Angle] = field(default_factory=dict)  # rad
-    scale: dict[str, Positive] = field(default_factory=dict)  # rad per unit of action
-    stiffness: dict[str, Positive] = field(default_factory=dict)  # kp, N m/rad
-    damping: dict[str, Amount] = field(default_factory=dict)  # kd, N m s/rad
-    armature: dict[str, Amount] = field(default_factory=dict)  # reflected inertia of the motor, kg m²
+    default_pose: dict[str, Angle] = field(default_factory=dict, hash=False)  # rad
+    scale: dict[str, Positive] = field(default_factory=dict, hash=False)  # rad per unit of action
+    stiffness: dict[str, Positive] = field(default_factory=dict, hash=False)  # kp, N m/rad
+    damping: dict[str, Amount] = field(default_factory=dict, hash=False)  # kd, N m s/rad
+    armature: dict[str, Amount] = field(default_factory=dict, hash=False)  # reflected inertia of the motor, kg m²
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from miniature import TINY
 from forgetmimic_jax import pretrain
 from forgetmimic_jax.motion import quality
 from forgetmimic_jax.motion.library import DATA_DIR
-from forgetmimic_jax.settings.config import preset
+from forgetmimic_jax.settings.config import Config, load_config, preset
 from forgetmimic_jax.tracking.setup import make_setup
 
 PHASES = [*TINY, "evaluate_every=4"]
@@ -26,10 +26,15 @@ def test_a_base_from_nothing_in_at_most_120_million_steps():
     assert config.ppo == preset("cpu").ppo
 
 
-def test_a_library_of_ones_own_starts_from_the_shipped_base(library_folder):
-    assert config_of(library=library_folder).base == str(DATA_DIR / "g1" / "base")
-    assert config_of(library=library_folder, base=Path("none")).base is None
-    assert config_of(library=library_folder, base=Path("mine")).base == "mine"
+def test_a_library_of_ones_own_starts_from_the_shipped_base_with_its_observations(library_folder):
+    shipped = DATA_DIR / "g1" / "base"
+    found = config_of(library=library_folder)
+    assert found.base == str(shipped)
+    assert found.observation == load_config(shipped / "config.yaml").observation != Config().observation
+    fresh = config_of(library=library_folder, base=Path("none"))
+    assert (fresh.base, fresh.observation) == (None, Config().observation)
+    other = DATA_DIR / "h2" / "base"
+    assert config_of(library=library_folder, base=other).base == str(other)
 
 
 def test_what_the_phases_cannot_work_with_is_told_in_one_line(refused, library_folder):
