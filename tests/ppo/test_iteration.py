@@ -200,7 +200,7 @@ def test_the_base_reads_its_observations_through_its_own_normalisers(run, robot)
     config = dataclasses.replace(
         config,
         ppo=dataclasses.replace(config.ppo, base_kl=0.5),
-        unlearn=dataclasses.replace(config.unlearn, method="trajdeleter"),
+        unlearn=dataclasses.replace(config.unlearn, method="trajdeleter", settings={}),
     )
     state = run.begin()
     found = run.collect(run.assets, state)

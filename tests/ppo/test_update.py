@@ -388,7 +388,7 @@ def test_ended_episodes_and_steps_are_counted_clip_by_clip(run):
 
 def with_method(run: Run, name: str) -> Environment:
     """The run's environment, whose training follows another method."""
-    unlearn = dataclasses.replace(run.env.config.unlearn, method=name)
+    unlearn = dataclasses.replace(run.env.config.unlearn, method=name, settings={})
     return dataclasses.replace(run.env, config=dataclasses.replace(run.env.config, unlearn=unlearn))
 
 

@@ -10,6 +10,7 @@ import pytest
 from trees import assert_same
 
 from forgetmimic_jax.basics.files import read_rows
+from forgetmimic_jax.robot.model import load_robot
 from forgetmimic_jax.settings.config import PretrainConfig
 from forgetmimic_jax.tracking.setup import Setup, make_setup
 from forgetmimic_jax.training import checkpoint, pretraining, watch
@@ -187,7 +188,8 @@ def test_a_run_that_is_killed_ends_with_the_same_bits(pretrain, unbroken, tmp_pa
             pretrain(folder, resume=number > 0, kill=kill)
     pretrain(folder, resume=True)
     for name in ("checkpoints/00000022", "best"):
-        policies = [checkpoint.load_policy(checkpoint.read_info(one / name)) for one in (folder, unbroken)]
+        infos = [checkpoint.read_info(one / name) for one in (folder, unbroken)]
+        policies = [checkpoint.load_policy(info, load_robot(info.robot)) for info in infos]
         assert_same(*policies)
     assert evaluations(folder) == evaluations(unbroken)
     infos = [checkpoint.read_info(newest_checkpoint(one)) for one in (folder, unbroken)]
