@@ -340,6 +340,15 @@ MUTANTS = (
            "Relearning is held to the policy that it starts from.",
            '"schedule": "fixed", "base_kl": 0.0}',
            '"schedule": "fixed", "base_kl": 1.0}'),
+    # Physics and signals: nothing waits forever.
+    Mutant("lapack_order", "forgetmimic_jax/physics/mjx.py", "tests/physics/test_mjx.py",
+           "Two factorisations of MJX's step may run at once, which two cores never end.",
+           "jnp.where(jnp.isfinite(data.qacc).all(), damping, jnp.nan)",
+           "damping"),
+    Mutant("second_signal", "forgetmimic_jax/basics/signals.py", "tests/basics/test_signals.py",
+           "A second Ctrl-C or SIGTERM ends nothing.",
+           "if received == 2:",
+           "if received == 3:"),
 )
 # fmt: on
 
