@@ -115,3 +115,12 @@ def deepmimic() -> Path:
     if not folder.is_dir():
         pytest.skip("DeepMimic's clips are not committed: no ../shared/data/deepmimic beside this checkout")
     return folder
+
+
+@pytest.fixture(scope="session")
+def public_policies() -> Path:
+    """Folder with public tracking policies of the G1."""
+    folder = SHARED / "policies"
+    if not folder.is_dir():
+        pytest.skip("public policies are not committed: no ../shared/data/policies beside this checkout")
+    return folder

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 
@@ -85,6 +85,12 @@ class EvaluationDocument(msgspec.Struct, kw_only=True, omit_defaults=True):
     budget: dict[str, dict[str, int | float]] = {}  # by policy, what its training cost
     made: Provenance | None = None  # absent in older files, as are the hashes
     policy_hashes: dict[str, str] = {}  # by policy, `checkpoint.policy_hash`
+    action_mode: Literal["residual", "offset"] = "residual"  # the setting `action.mode`; absent if residual
+
+    @property
+    def zero_action(self) -> str:
+        """What the joint controllers do in the zero-action baseline."""
+        return {"residual": "replay the clip", "offset": "hold the default pose"}[self.action_mode]
 
     @property
     def subject(self) -> str | None:

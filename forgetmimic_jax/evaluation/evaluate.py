@@ -66,6 +66,7 @@ def evaluate(
         budget={name: {"environment_steps": subject.environment_steps} for name, subject in subjects.items()},
         made=made_here(),
         policy_hashes={name: subject.policy_hash for name, subject in subjects.items()},
+        action_mode=setup.config.action.mode,
     )
 
 

@@ -220,7 +220,9 @@ def notes(document: EvaluationDocument) -> list[str]:
         f"0 successes of {document.episodes} still allow a rate of up to {nothing} (95 % interval).",
     ]
     if ZERO_ACTION in document.policies:
-        lines.append("baseline: tracking with zero actions; the joint controllers replay the clip without a policy.")
+        lines.append(
+            f"baseline: tracking with zero actions; the joint controllers {document.zero_action} without a policy."
+        )
     if document.targets:
         lines.append("degradation ratio: target over kept, of tracking while alive (the paper's) and of tracking.")
     if document.subject and BASE in document.policies:

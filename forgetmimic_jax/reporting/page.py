@@ -34,6 +34,7 @@ def page(subject: Subject, verdict: Verdict, facts: Mapping[str, Any], films: tu
         **facts,
         title=f"Unlearning {listed(subject.document.targets)}: {subject.document.robot}",
         verdict=verdict,
+        zero_action=subject.document.zero_action,
         tables=tables.result_tables(subject.document),
         figures=figures,
         films=films[0],
