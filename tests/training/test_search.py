@@ -14,8 +14,21 @@ from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.training.search import SearchConfig, first_failures, search, straight_lines
 from forgetmimic_jax.training.start import fresh_policy
 
-ROLLOUTS, JOINTS, SWAY, TURN = 32, 29, 0, 1
+ROLLOUTS, JOINTS, BODIES, SWAY, TURN = 32, 29, 14, 0, 1
 CONFIG = SearchConfig(before=10, window=12, after=4, rounds=8, noisy_rounds=6, starting_std=0.5)
+
+
+class Stumble:
+    """An engine whose robots stand still; a foot hits the ground hard in the fourth control step, and only then."""
+
+    def step(self, state, parameters, joint_target, wrench):
+        clock = state.warmstart.at[:, 0].add(1.0)  # zeros at the start of an episode
+        force = jnp.where(clock[:, :1, None] == 4.0, 1e4, 0.0) * jnp.ones((len(clock), BODIES, 3))
+        return dataclasses.replace(state, warmstart=clock), dataclasses.replace(self.bodies, contact_force=force)
+
+    def forward(self, state, parameters, mask, bodies):
+        self.bodies = bodies
+        return bodies
 
 
 @pytest.fixture(scope="module")
@@ -93,6 +106,13 @@ def test_a_clip_that_is_completed_has_no_failure(env, assets, policy):
     few = dataclasses.replace(env, num_envs=1)
     with pytest.raises(ValueError, match="1 robots for 2 clips"):
         first_failures(few, assets, policy)
+
+
+def test_a_robot_that_has_failed_stays_failed(env, assets, policy):
+    loose = dataclasses.replace(env.config.termination, anchor_height=9.0, orientation=9.0, end_effector_height=9.0)
+    config = dataclasses.replace(env.config, termination=loose)
+    stumbling = dataclasses.replace(env, config=config, engine=Stumble())
+    np.testing.assert_array_equal(first_failures(stumbling, assets, policy), [3, 3])
 
 
 def test_search_passes_the_frame_at_which_the_policy_fails(env, assets, policy, found, survived):
