@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from forgetmimic_jax.policy.gaussian import log_prob
+from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.ppo.rule import Rule
 from forgetmimic_jax.ppo.state import TrainState
 from forgetmimic_jax.ppo.transition import Outcome, Transition
@@ -26,6 +27,7 @@ def collect(env: Environment, assets: Assets, state: TrainState, rule: Rule) -> 
     config, policy = env.config, state.policy
     probabilities = tracking.start_probabilities(config, assets, state.failure_level)
     gains = wrench_gain(config.wrench, state.failure_level)
+    unknown = jnp.zeros((env.num_envs,))  # the values, until the rollout is over
 
     def observe(episodes: tracking.EnvState, key: Array) -> tuple[Array, Array]:
         actor_obs, critic_obs = tracking.observe(env, assets, episodes, key if env.noisy else None)
@@ -53,8 +55,8 @@ def collect(env: Environment, assets: Assets, state: TrainState, rule: Rule) -> 
         )
         outcome = Outcome(
             reward=reward * env.control_step,
-            value=policy.value(critic_obs),
-            next_value=policy.value(last_critic_obs),
+            value=unknown,
+            next_value=unknown,
             tracking=result.reward.tracking,
             regularisation=result.reward.regularisation,
             normalized_tracking=result.reward.normalized_tracking,
@@ -67,14 +69,39 @@ def collect(env: Environment, assets: Assets, state: TrainState, rule: Rule) -> 
             wrench_gain=before.wrench_gain,
             causes=result.causes,
         )
-        return (fresh, *observe(fresh, observe_key)), (transition, outcome)
+        return (fresh, *observe(fresh, observe_key)), (transition, outcome, last_critic_obs)
 
     key, first_key, rollout_key = jax.random.split(state.key, 3)
     keys = jax.random.split(rollout_key, config.ppo.num_steps)
     leader = jnp.arange(env.num_envs) // config.ppo.branches * config.ppo.branches
     start = jax.tree.map(lambda x: x[leader], state.env) if config.ppo.branches > 1 else state.env
-    (episodes, _, _), (transition, outcome) = jax.lax.scan(one_step, (start, *observe(start, first_key)), keys)
+    first = (start, *observe(start, first_key))
+    (episodes, _, critic_obs), (transition, outcome, last_critic_obs) = jax.lax.scan(one_step, first, keys)
+    # The critic is not needed to act, so it sees the whole rollout at once. That is faster.
+    value = policy.value(transition.critic_observation)
+    following = jnp.concatenate([value[1:], policy.value(critic_obs)[None]])
+    last_value = values_where(policy, last_critic_obs, outcome.truncated, env.num_envs)
+    outcome = dataclasses.replace(outcome, value=value, next_value=jnp.where(outcome.truncated, last_value, following))
     return dataclasses.replace(state, env=episodes, key=key), transition, outcome
+
+
+def values_where(policy: Policy, observation: Array, mask: Array, chunk: int) -> Array:
+    """V [...] at critic observations [..., features] where the mask [...] is true, and 0 elsewhere.
+
+    Few rows are true. So the critic sees these rows alone, `chunk` rows at a time.
+    """
+    rows = observation.reshape(-1, observation.shape[-1])
+    wanted = jnp.argsort(~mask.reshape(-1), stable=True)  # the true rows first
+    count = mask.sum()
+
+    def one_chunk(carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        begin, values = carry
+        chosen = jax.lax.dynamic_slice(wanted, (begin,), (chunk,))
+        return begin + chunk, values.at[chosen].set(policy.value(rows[chosen]))
+
+    start = (jnp.zeros((), count.dtype), jnp.zeros(len(rows)))
+    _, values = jax.lax.while_loop(lambda carry: carry[0] < count, one_chunk, start)
+    return jnp.where(mask, values.reshape(mask.shape), 0.0)
 
 
 def draw_states(env: Environment, assets: Assets, state: TrainState) -> tuple[TrainState, Transition]:

@@ -24,7 +24,7 @@ class Outcome:
 
     reward: Array  # R' × control step
     value: Array  # V(s_t)
-    next_value: Array  # V of the state reached, before any reset
+    next_value: Array  # V of the state reached, before any reset; meaningless where the episode terminated
     tracking: Array  # R_track
     regularisation: Array  # R_reg
     normalized_tracking: Array  # r̄
