@@ -91,6 +91,7 @@ def memory(setup: Setup) -> Figures:
     env, assets = tracking.make_environment(setup, config.ppo.num_envs), tracking.make_assets(setup)
     iteration = jax.jit(make_iteration(env, Rule()), donate_argnums=1)
     found = iteration.lower(assets, template(env, assets)).compile().memory_analysis()
+    assert found is not None  # every backend of JAX that this program runs on has it
     state = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(template(env, assets)))
     rollout = found.temp_size_in_bytes
     return {
