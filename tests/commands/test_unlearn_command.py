@@ -203,6 +203,26 @@ def test_a_preset_brings_its_settings_but_keeps_the_base_s_network(options, base
             {"set": [["unlearn.settings.penalt=3"]]},
             "unlearn.settings: arft has no setting 'penalt'; did you mean 'penalty'?",
         ),
+        (
+            {"method": "stand", "set": [["unlearn.instead=sawy"]]},
+            "unlearn.instead: no clip 'sawy' in the library; did you mean 'sway'?",
+        ),
+        (
+            {"method": "stand", "set": [["unlearn.instead=turn"]]},
+            "unlearn.instead: 'turn' is a clip to forget; known: stand, sway, nod",
+        ),
+        (
+            {"set": [["unlearn.instead=sway"]]},
+            "unlearn.instead: found sway; accepted: nothing, since arft teaches nothing in the place of the targets",
+        ),
+        (
+            {"method": "finetune", "set": [["unlearn.stop_every=20"]]},
+            "unlearn.stop_every: found 20; accepted: 0, since finetune has no stop rule",
+        ),
+        (
+            {"set": [["unlearn.stop_every=-1"]]},
+            "unlearn.stop_every: found -1; accepted: a whole number from 0",
+        ),
         ({"episodes": 0}, "--episodes: found 0; accepted: 1 or more"),
         ({"iterations": 0}, "iterations: found 0; accepted: a whole number from 1"),
         ({"iterations": -1}, "iterations: found -1; accepted: a whole number from 1"),
