@@ -29,7 +29,7 @@ from forgetmimic_jax.tracking.reference import align_to_anchor, anchor_between, 
 from forgetmimic_jax.tracking.reward import Pair
 from forgetmimic_jax.tracking.rsi import Bins, bin_probabilities, make_bins, sample_start
 from forgetmimic_jax.tracking.setup import Setup
-from forgetmimic_jax.tracking.stand import fallen
+from forgetmimic_jax.tracking.stand import falls
 from forgetmimic_jax.tracking.termination import terminations
 from forgetmimic_jax.tracking.wrench import reference_wrench
 
@@ -251,9 +251,8 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
     causes = terminations(config.termination, reference, aligned, bodies, robot)
     if env.runs_on:
         is_target = assets.is_target[state.clip]
-        # A robot that lies already, such as at the start of a clip of getting up, does not fall.
-        fall = fallen(robot, bodies) & ~fallen(robot, state.bodies)
-        causes = {name: broken & ~is_target for name, broken in causes.items()} | {"fall": fall & is_target}
+        causes = {name: broken & ~is_target for name, broken in causes.items()}
+        causes["fall"] = is_target & falls(robot, state.bodies, bodies)
     terminated = diverged | jnp.stack(list(causes.values())).any(0)
     steps = state.step + 1
     new = dataclasses.replace(

@@ -43,7 +43,21 @@ def fallen(robot: Robot, bodies: Bodies) -> Array:
         robot: whose bodies they are.
         bodies: [env, key_body].
     """
+    return _broken(robot, bodies).any(0)
+
+
+def falls(robot: Robot, before: Bodies, after: Bodies) -> Array:
+    """bool[env]: one of the two rules of `fallen` is broken after a step and was not before it.
+
+    So a robot that lies at the start of a clip of getting up does not fall, and one that leans in the middle of a kick
+    falls when its root is low.
+    """
+    return (_broken(robot, after) & ~_broken(robot, before)).any(0)
+
+
+def _broken(robot: Robot, bodies: Bodies) -> Array:
+    """bool[2, env]: the root is low; the anchor is tilted."""
     quat = bodies.quat[:, robot.anchor]
     up = rotation.rotate(quat, jnp.zeros_like(bodies.pos[:, robot.anchor]).at[:, 2].set(1.0))
     low = bodies.pos[:, robot.root, 2] < FALL_HEIGHT * robot.default_height
-    return low | (up[:, 2] < np.cos(FALL_TILT))
+    return jnp.stack([low, up[:, 2] < np.cos(FALL_TILT)])

@@ -86,6 +86,16 @@ def test_a_robot_that_lies_already_does_not_fall(setup):
     assert not stepped(setup, lying, before=lying).terminated.any()
 
 
+def test_a_robot_that_leans_already_falls_when_it_is_low(setup):
+    leaning = tilted(setup.robot.anchor, 70.0)
+    assert not stepped(setup, leaning, before=leaning).terminated[1]
+
+    def both(bodies):
+        return low(setup.robot.root, 0.1)(leaning(bodies))
+
+    np.testing.assert_array_equal(stepped(setup, both, before=leaning).causes["fall"], [False, True])
+
+
 def test_a_robot_that_comes_apart_is_still_terminated(setup):
     result = stepped(setup, low(setup.robot.root, np.nan))
     np.testing.assert_array_equal(result.diverged, [True, True])
