@@ -99,6 +99,17 @@ def load_library(
     return build_library(robot, read_library(robot, path, clips), fps)
 
 
+def only_clips(library: MotionLibrary, names: Sequence[str]) -> MotionLibrary:
+    """The clips called `names`, in this order, without the frames that only longer clips have."""
+    chosen = np.array([library.names.index(name) for name in names])
+    frames = int(np.asarray(library.length)[chosen].max())
+    return MotionLibrary(
+        frames=jax.tree.map(lambda values: values[chosen, :frames], library.frames),
+        length=library.length[chosen],
+        names=tuple(names),
+    )
+
+
 def read_library(robot: Robot, path: Path | None = None, clips: Sequence[str] | None = None) -> list[Clip]:
     """The library's clips as they are on disk; arguments and errors as in `load_library`."""
     path = DATA_DIR / robot.name if path is None else Path(path)

@@ -145,6 +145,7 @@ class Lab:
             "physics": options.physics,
             "library": options.library,
             "preset": "paper" if options.preset == "paper" else None,  # else the base's own settings
+            "no_stop": True,  # rows are compared at the same budget
         }
         together = [*itertools.chain(*options.set), *variant.get("set", [])]
         return make_trial(options.trials, {**conditions, **variant, "set": together})
