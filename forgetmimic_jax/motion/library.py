@@ -71,9 +71,10 @@ def build_library(robot: Robot, clips: Sequence[Clip], fps: float = 50.0) -> Mot
     lengths = [len(row.joint_pos) for row in rows]
 
     def padded(*values: np.ndarray) -> Array:
-        missing = [[(0, max(lengths) - len(value))] + [(0, 0)] * (value.ndim - 1) for value in values]
-        stacked = [np.pad(value, width, mode="edge") for value, width in zip(values, missing, strict=True)]
-        return jnp.asarray(np.stack(stacked), jnp.float32)
+        stacked = np.empty((len(values), max(lengths), *values[0].shape[1:]), np.float32)
+        for row, value in zip(stacked, values, strict=True):
+            row[: len(value)], row[len(value) :] = value, value[-1]
+        return jnp.asarray(stacked)
 
     return MotionLibrary(
         frames=jax.tree.map(padded, *rows),

@@ -46,6 +46,7 @@ class Roles:
     joint_motors: tuple[tuple[str, str], ...]  # (pattern, motor): the first pattern that matches gives the motor
     ignored_motors: tuple[str, ...]  # patterns of the joints whose motor load does not count
     default_pose: Mapping[str, float]  # rad; a joint that is not named is 0
+    variants: Mapping[int, tuple[str, ...]]  # patterns of the joints that a variant lacks, by the number it has
 
     def motor_of(self, joint: str) -> Motor:
         """The motor of a joint."""
@@ -69,6 +70,7 @@ def read_roles(path: Path) -> Roles:
     if not isinstance(content, dict):
         raise InputError(f"{path}: found {content!r}; accepted: a table of {', '.join(FIELDS)}")
     problems = [f"unknown field '{name}'; {nearest(str(name), FIELDS)}" for name in content if name not in FIELDS]
+    content = {**OPTIONAL, **content}
     problems += [f"missing field '{name}'" for name in FIELDS if name not in content]
     values: dict[str, Any] = {}
     for name in FIELDS:
@@ -129,6 +131,16 @@ def _pattern(value: Any) -> str:
     except re.error as error:
         raise _Wrong(f"'{value}' is no regular expression ({error})") from None
     return value
+
+
+def _patterns(value: Any) -> tuple[str, ...]:
+    return tuple(_pattern(pattern) for pattern in _names(value))
+
+
+def _count(value: str) -> int:
+    if not value.isdigit():
+        raise _Wrong(f"found {value!r}; accepted: a number of joints")
+    return int(value)
 
 
 def _rules(value: Any) -> tuple[tuple[str, str], ...]:
@@ -193,6 +205,8 @@ FIELDS: Mapping[str, Callable[[Any], Any]] = {
     "default_height": _positive,
     "motors": lambda value: _table(value, lambda motor: _record(Motor, motor, _positive)),
     "joint_motors": _rules,
-    "ignored_motors": lambda value: tuple(_pattern(pattern) for pattern in _names(value)),
+    "ignored_motors": _patterns,
     "default_pose": lambda value: _table(value, _number),
+    "variants": lambda value: {_count(count): patterns for count, patterns in _table(value, _patterns).items()},
 }
+OPTIONAL: Mapping[str, Any] = {"variants": {}}

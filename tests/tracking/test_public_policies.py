@@ -20,7 +20,8 @@ import yaml
 
 from forgetmimic_jax.motion.clip import Clip
 from forgetmimic_jax.motion.library import build_library
-from forgetmimic_jax.motion.readers import Reading, read_motion
+from forgetmimic_jax.motion.readers import read_motion
+from forgetmimic_jax.motion.recording import Reading
 from forgetmimic_jax.robot.model import Robot, load_robot
 from forgetmimic_jax.settings.config import ActionConfig, ObservationConfig
 from forgetmimic_jax.tracking import env as tracking
@@ -84,7 +85,7 @@ def dance(folder: Path, robot: Robot) -> Public:
     folder = folder / "unitree_rl_lab_dance_102"
     said = yaml.safe_load((folder / "deploy.yaml").read_text())
     order = said["joint_ids_map"]
-    clip = read_motion(robot, folder / "G1_Take_102.bvh_60hz.csv", Reading(fps=60.0))
+    clip = read_motion(robot, folder / "G1_Take_102.bvh_60hz.csv", Reading(fps=60.0)).clip
     return Public(
         session=onnxruntime.InferenceSession(folder / "policy.onnx"),
         joints=[robot.joint_names[joint] for joint in order],
