@@ -24,7 +24,7 @@ from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.exchange.adopt import own_setup
 from forgetmimic_jax.exchange.foreign import Reading, read_policy
 from forgetmimic_jax.exchange.imported import with_actor
-from forgetmimic_jax.motion.library import build_library
+from forgetmimic_jax.motion.library import build_library, read_library
 from forgetmimic_jax.tracking.env import make_assets
 from forgetmimic_jax.training.start import fresh_policy
 
@@ -189,17 +189,10 @@ def test_garbage_in_the_first_frames_is_named_and_can_be_left_out(robot, library
     assert left.clip.num_frames == 78
 
 
-def test_a_clip_beside_a_policy_is_taken_at_the_rate_in_its_name(robot, library, tmp_path):
+def test_a_clip_beside_a_policy_is_taken_at_the_rate_in_its_name(robot, tmp_path):
     file = lab_folder(tmp_path / "dance", robot)
-    frames = library.frames
-    rows = np.concatenate(
-        [
-            np.asarray(frames.bodies.pos)[0, :80, robot.root],
-            np.roll(np.asarray(frames.bodies.quat)[0, :80, robot.root], -1, axis=-1),
-            np.asarray(frames.joint_pos)[0, :80],
-        ],
-        axis=-1,
-    )
+    (clip,) = read_library(robot, clips=["punch"])
+    rows = np.concatenate([clip.root_pos, np.roll(clip.root_quat, -1, axis=-1), clip.joint_pos], axis=-1)[:80]
     motion = tmp_path / "dance" / "params" / "take 1_100hz.csv"
     np.savetxt(motion, rows, delimiter=",")
     foreign = read(file, robot)
