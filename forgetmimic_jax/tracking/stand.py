@@ -46,15 +46,6 @@ def fallen(robot: Robot, bodies: Bodies) -> Array:
     return low(robot, bodies) | tilted(robot, bodies)
 
 
-def falls(robot: Robot, before: Bodies, after: Bodies) -> Array:
-    """bool[env]: one of the two rules of `fallen` is broken after a step and was not before it.
-
-    So a robot that lies at the start of a clip of getting up does not fall, and one that leans in the middle of a kick
-    falls when its root is low.
-    """
-    return (low(robot, after) & ~low(robot, before)) | (tilted(robot, after) & ~tilted(robot, before))
-
-
 def low(robot: Robot, bodies: Bodies) -> Array:
     """bool[env]: the root is below half of its standing height; arguments as in `fallen`."""
     return bodies.pos[:, robot.root, 2] < FALL_HEIGHT * robot.default_height
@@ -65,3 +56,12 @@ def tilted(robot: Robot, bodies: Bodies) -> Array:
     quat = bodies.quat[:, robot.anchor]
     up = rotation.rotate(quat, jnp.zeros_like(bodies.pos[:, robot.anchor]).at[:, 2].set(1.0))
     return up[:, 2] < np.cos(FALL_TILT)
+
+
+def falls(robot: Robot, before: Bodies, after: Bodies) -> Array:
+    """bool[env]: the robot is low or tilted after a step, and was not so before it; arguments as in `fallen`.
+
+    So a robot that lies at the start of a clip of getting up does not fall, and one that leans in the middle of a kick
+    falls when it is low.
+    """
+    return (low(robot, after) & ~low(robot, before)) | (tilted(robot, after) & ~tilted(robot, before))

@@ -80,7 +80,8 @@ def regression(config: Config, batch: Batch, now: Prediction, iteration: Array) 
     return loss, metrics | {"teacher_kl": learn, "base_kl": keep}
 
 
-PACE = Pace({"cpu": 240, "paper": 400}, {"cpu": SHORT}, {"cpu": 0.5})
+# A regression: the number of gradient steps decides, and a rollout serves many of them.
+PACE = Pace({"cpu": 80, "paper": 400}, {"cpu": {**SHORT, "minibatches": 12, "epochs": 4}}, {"cpu": 0.5})
 METHOD = Method(
     loss=regression,
     teach=taught_action,

@@ -222,7 +222,7 @@ def test_a_preset_brings_its_settings_but_keeps_the_base_s_network(options, base
         ),
         (
             {"set": [["unlearn.stop_every=-1"]]},
-            "unlearn.stop_every: found -1; accepted: a whole number from 0",
+            "--set: unlearn.stop_every: found -1; accepted: a whole number from 0",
         ),
         ({"episodes": 0}, "--episodes: found 0; accepted: 1 or more"),
         ({"iterations": 0}, "iterations: found 0; accepted: a whole number from 1"),
@@ -469,8 +469,8 @@ def test_a_stop_rule_is_the_default_where_a_method_has_one(options):
 
 
 def test_a_base_that_cannot_stand_learns_that_first_and_then_teaches(options, tmp_path, capsys):
-    def stand(iterations: int, **given) -> unlearn.Options:
-        steps = [f"unlearn.settings.stand_iterations={iterations}"]
+    def stand(learning: int, **given) -> unlearn.Options:
+        steps = [f"unlearn.settings.stand_iterations={learning}"]
         return options(**{"method": "stand", "output": tmp_path / "run", "episodes": 1, "set": [steps]} | given)
 
     unlearn.main(stand(2, iterations=2))

@@ -17,10 +17,10 @@ from forgetmimic_jax.training.stopping import Stopping, settles_from
     ("curve", "expected"),
     [
         ([], None),
-        ([0.9, 0.5, 0.2, 0.06], None),
-        ([0.9, 0.04], None),
-        ([0.9, 0.05, 0.05], 60),
-        ([0.9, 0.04, 0.06, 0.03, -0.2], 100),  # not in a row, and then it is
+        ([0.9, 0.5, 0.2, 0.11], None),
+        ([0.9, 0.09], None),
+        ([0.9, 0.1, 0.1], 60),
+        ([0.9, 0.09, 0.11, 0.08, -0.2], 100),  # not in a row, and then it is
         ([-0.1, -0.1, 0.9], 40),  # what comes later changes nothing
         ([float("nan")] * 3, None),  # skill is undefined where the base is no better than zero action
     ],
