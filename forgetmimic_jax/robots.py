@@ -91,7 +91,9 @@ def check(options: Check) -> None:
         print(_try(file))
     closing({"roles": file, "picture": folder / f"{name}.png"}, command_line("robot", f"add {file}"))
     if proposal.missing:
-        raise InputError(f"{options.file}: {len(proposal.missing)} things are missing; complete {file}, then robot add")
+        raise InputError(
+            f"{options.file}: {len(proposal.missing)} thing(s) are missing; complete {file}, then robot add"
+        )
 
 
 def add(options: Add) -> None:

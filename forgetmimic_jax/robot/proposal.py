@@ -55,6 +55,11 @@ def propose(file: Path) -> Proposal:
         )
         spec, _ = read_mjcf(file, Additions(fixed=[re.escape(joint) for joint in fixed]))
         model = spec.copy().compile()
+    bare = set(range(1, model.nbody)) - {int(model.geom_bodyid[g]) for g in np.flatnonzero(model.geom_conaffinity)}
+    if bare:
+        notes.append(
+            f"{len(bare)} of {model.nbody - 1} bodies have no shape that touches: they pass through the ground"
+        )
     tree = Tree(model)
     limbs = tree.limbs()
     roles: dict[str, Any] = {"model": file.name}

@@ -30,14 +30,16 @@ class Tree:
     def _counterparts(self) -> dict[int, int]:
         """Each body's other side, left to right and right to left: by the name, otherwise by the place."""
         found: dict[int, int] = {}
+        depth = np.array([len(self.above(body)) for body in range(self.model.nbody)])
         for body in range(1, self.model.nbody):
             named = [self.names[body].replace(a, b) for pair in SIDE_WORDS for a, b in (pair, pair[::-1])]
             other = next(
                 (self.names.index(name) for name in named if name != self.names[body] and name in self.names), None
             )
             if other is None and abs(self.pos[body, 1]) > MIRROR:
-                away = np.linalg.norm(self.pos[1:] - self.pos[body] * [1, -1, 1], axis=-1)
-                other = 1 + int(np.argmin(away)) if away.min() < MIRROR else None
+                away = np.linalg.norm(self.pos - self.pos[body] * [1, -1, 1], axis=-1)
+                away[depth != depth[body]] = np.inf
+                other = int(np.argmin(away)) if away.min() < MIRROR else None
             if other is not None and other != body:
                 found[body] = other
         return {body: other for body, other in found.items() if found.get(other) == body}

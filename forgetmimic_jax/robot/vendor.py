@@ -206,7 +206,8 @@ def _set_joints(spec: mujoco.MjSpec, additions: Additions, notes: list[str]) -> 
     for name, limits in additions.ranges.items():
         joint = spec.joint(name)
         if joint is not None:
-            joint.range, joint.limited = list(limits), True
+            joint.range = np.degrees(limits) if spec.compiler.degree else list(limits)
+            joint.limited = True
 
 
 def _set_shapes(spec: mujoco.MjSpec, additions: Additions, notes: list[str]) -> None:
@@ -244,9 +245,6 @@ def _set_shapes(spec: mujoco.MjSpec, additions: Additions, notes: list[str]) -> 
                 friction=[FRICTION, 0.005, 0.0001],
                 mass=0.0,
             )
-    bare = [body.name for body in spec.bodies[1:] if not any(geom.conaffinity for geom in body.geoms)]
-    if len(bare) > 0.5 * len(spec.bodies[1:]):
-        notes.append(f"{len(bare)} bodies have no shape that touches: they pass through the ground")
     if not any(geom.group == SEEN_GROUP for body in spec.bodies[1:] for geom in body.geoms):
         _add_bones(spec)
         notes.append("no shape is there to be seen: bones are drawn")
