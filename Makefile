@@ -27,7 +27,7 @@ flag_value = $(if $(filter $(1),$(SWITCHES)),$(filter-out 1,$($(1))),'$(subst ',
 flag = $(if $($(1)),--$(call flag_name,$(1)) $(call flag_value,$(1)))
 FLAGS = $(foreach name,$(filter-out ARGS PYTHON SWEEP,$(given)),$(call flag,$(name)))
 
-COMMANDS = pretrain train unlearn evaluate export play video report motions bench
+COMMANDS = pretrain train unlearn evaluate export play video report motions robot bench
 STUDIES = validity comparison penalty heat_map motion_types physical_behaviour training_dynamics relearning membership \
 	number_of_targets
 
@@ -51,6 +51,7 @@ export: ## write CHECKPOINT as ONNX for deploy tools, checked in plain MuJoCo
 play: ## watch CHECKPOINT live in a web page, beside its base
 video: ## film CHECKPOINT clip by clip, beside its base: MP4, GIF and a page of stills
 report: ## write one HTML page about the unlearning run in RUN
+robot: ## make a robot of a vendor's MJCF (ARGS=--help says how)
 motions: ## make a library from your own clips (ARGS=--help says how)
 bench: ## measure the speed of training on this machine
 $(COMMANDS): .venv/.installed

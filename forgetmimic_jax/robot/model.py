@@ -22,6 +22,7 @@ from forgetmimic_jax.basics.places import shipped
 from forgetmimic_jax.robot.check import FLOOR
 from forgetmimic_jax.robot.roles import Roles, read_roles
 from forgetmimic_jax.robot.sides import Pairs, body_ids, counterparts, sides_of_bodies
+from forgetmimic_jax.robot.vendor import read_mjcf
 from forgetmimic_jax.settings.config import ActionConfig, PhysicsConfig
 
 ROBOTS_DIR = shipped("robots")
@@ -176,13 +177,14 @@ def load_robot(
 
 
 def read_spec(name: str, robots_dir: Path = ROBOTS_DIR) -> mujoco.MjSpec:
-    """A robot's MJCF as it is in its folder, with the shapes that are only seen.
+    """A robot's MJCF, mended where it is a vendor's, with the shapes that are only seen.
 
     Raises:
         InputError: unknown robot, or roles that are wrong or do not fit the MJCF.
     """
     path = roles_file(name, robots_dir)
-    return mujoco.MjSpec.from_file(str(path.parent / read_roles(path).model))
+    roles = read_roles(path)
+    return read_mjcf(path.parent / roles.model, roles.additions)[0]
 
 
 def relative_height(model: mujoco.MjModel) -> float:

@@ -26,7 +26,7 @@ def run(monkeypatch, *arguments: str) -> int:
 
 def test_the_commands_are_the_modules_at_the_top_of_the_package():
     files = {path.stem.replace("_", "-") for path in PACKAGE.glob("*.py")}
-    assert set(program.commands()) == files - {"--init--", "--main--"}
+    assert set(program.commands()) == files - {"--init--", "--main--", "robots"} | {"robot"}
 
 
 @pytest.mark.parametrize("arguments", [[], ["--help"], ["-h"]])
@@ -51,7 +51,7 @@ def test_a_command_gets_the_arguments_after_its_name(monkeypatch, capsys):
     assert capsys.readouterr() == ("", "error: --seed: found -1; accepted: 0 or more\n")
 
 
-@pytest.mark.parametrize("command", [name for name in program.commands() if name != "motions"])
+@pytest.mark.parametrize("command", [name for name in program.commands() if name not in ("motions", "robot")])
 def test_help_lists_every_option_with_its_default(command, capsys):
     options = importlib.import_module(f"forgetmimic_jax.{command.replace('-', '_')}").Options
     with pytest.raises(SystemExit) as exit_:
@@ -74,7 +74,7 @@ def test_help_waits_for_no_heavy_import():
         "    importlib.import_module(f'forgetmimic_jax.{name}')\n"
         "    print(name, *sorted(set(sys.argv[1].split()) & set(sys.modules)))"
     )
-    modules = [name.replace("-", "_") for name in program.commands()]
+    modules = [program.module_of(name) for name in program.commands()]
     printed = subprocess.run(
         [sys.executable, "-c", code, " ".join(HEAVY), *modules], capture_output=True, text=True, check=True
     )

@@ -150,6 +150,9 @@ def test_joint_velocities_that_belong_to_other_joints(robot, clip, tmp_path):
     velocities = np.gradient(clip.joint_pos, 1 / 50, axis=0)
     np.savez(tmp_path / "a.npz", **fields, joint_vel=velocities)
     assert "rate: joint_vel fits 50.0 frames per s" in assert_read(robot, tmp_path / "a.npz", clip)
+    assert "read at 25, but joint_vel fits 50 frames per s; give --fps 50" in refusal(
+        robot, tmp_path / "a.npz", fps=25.0
+    )
     np.savez(tmp_path / "a.npz", **fields, joint_vel=velocities[:, ::-1])
     assert "not the velocities of joint_pos" in refusal(robot, tmp_path / "a.npz")
 
