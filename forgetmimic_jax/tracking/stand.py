@@ -37,13 +37,13 @@ def stand_frame(robot: Robot) -> Frames:
 
 
 def fallen(robot: Robot, bodies: Bodies) -> Array:
-    """bool[env]: the root is below half of its standing height, or the anchor is tilted by more than 60 degrees.
+    """bool[env]: the robot is `low`, or it is `tilted`.
 
     Args:
         robot: whose bodies they are.
         bodies: [env, key_body].
     """
-    return _broken(robot, bodies).any(0)
+    return low(robot, bodies) | tilted(robot, bodies)
 
 
 def falls(robot: Robot, before: Bodies, after: Bodies) -> Array:
@@ -52,12 +52,17 @@ def falls(robot: Robot, before: Bodies, after: Bodies) -> Array:
     So a robot that lies at the start of a clip of getting up does not fall, and one that leans in the middle of a kick
     falls when its root is low.
     """
-    return (_broken(robot, after) & ~_broken(robot, before)).any(0)
+    gets_low = low(robot, after) & ~low(robot, before)
+    return gets_low | (tilted(robot, after) & ~tilted(robot, before))
 
 
-def _broken(robot: Robot, bodies: Bodies) -> Array:
-    """bool[2, env]: the root is low; the anchor is tilted."""
+def low(robot: Robot, bodies: Bodies) -> Array:
+    """bool[env]: the root is below half of its standing height; arguments as in `fallen`."""
+    return bodies.pos[:, robot.root, 2] < FALL_HEIGHT * robot.default_height
+
+
+def tilted(robot: Robot, bodies: Bodies) -> Array:
+    """bool[env]: the anchor is tilted by more than 60 degrees; arguments as in `fallen`."""
     quat = bodies.quat[:, robot.anchor]
     up = rotation.rotate(quat, jnp.zeros_like(bodies.pos[:, robot.anchor]).at[:, 2].set(1.0))
-    low = bodies.pos[:, robot.root, 2] < FALL_HEIGHT * robot.default_height
-    return jnp.stack([low, up[:, 2] < np.cos(FALL_TILT)])
+    return up[:, 2] < np.cos(FALL_TILT)
