@@ -57,6 +57,12 @@ def lines(load, *arguments):
         ),
         (lambda roles: roles["pairs"].update(feet=["left_ankle_roll_link"]), "pairs: feet: found 1 names"),
         (lambda roles: roles["pairs"].pop("elbows"), "pairs: missing 'elbows'"),
+        (lambda roles: roles.pop("head"), "missing field 'head'"),
+        (lambda roles: roles.update(head="head"), "head: found 'head'; accepted: a list of names"),
+        (
+            lambda roles: roles.update(head=["haed"]),
+            "head: no geom 'haed' in g1.xml touches the floor; did you mean 'head'?",
+        ),
         (lambda roles: roles["pairs"].update(elbow=["a", "b"]), "pairs: unknown 'elbow'; did you mean 'elbows'?"),
         (lambda roles: roles["pairs"]["knees"].reverse(), "'right_hip_pitch_link' is on the left, but on the right by"),
         (
