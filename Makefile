@@ -15,6 +15,7 @@
 ## OUTPUT       where the results go (default: under runs/)
 ## RESUME       1 continues the run in OUTPUT
 ## SWEEP        lambda, targets, sampler or seeds (default: lambda)
+## CLUSTER      address of a dask scheduler whose workers run the trials of sweep and experiments (default: none)
 ## ARGS         flags as they are, and what comes before them; ARGS=--help lists all flags
 ## PYTHON       the Python that .venv is made from, 3.11 to 3.14 (default: the first found)
 PROGRAM = .venv/bin/python -m forgetmimic_jax
