@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -9,6 +11,7 @@ from jax import Array
 
 from forgetmimic_jax.basics import rotation
 from forgetmimic_jax.motion.library import Frames, MotionLibrary
+from forgetmimic_jax.robot.bodies import Bodies
 
 
 def lookup(library: MotionLibrary, clip: Array, frame: Array) -> Frames:
@@ -79,4 +82,23 @@ def align_to_anchor(reference: Frames, anchor: int, anchor_pos: Array, anchor_qu
     return AlignedBodies(
         pos=origin + rotation.rotate(turn, reference.bodies.pos - ref_pos[:, None]),
         quat=rotation.multiply(turn, reference.bodies.quat),
+    )
+
+
+def at_anchor(reference: Frames, anchor: int, anchor_pos: Array, anchor_quat: Array) -> Frames:
+    """The whole reference [env], its velocities too, moved as by `align_to_anchor`, with the same arguments."""
+    aligned = align_to_anchor(reference, anchor, anchor_pos, anchor_quat)
+    ref_quat = reference.bodies.quat[:, anchor]
+    turn = rotation.yaw_only(rotation.multiply(anchor_quat, rotation.conjugate(ref_quat)))
+    bodies = Bodies(
+        pos=aligned.pos,
+        quat=aligned.quat,
+        lin_vel=rotation.rotate(turn[:, None], reference.bodies.lin_vel),
+        ang_vel=rotation.rotate(turn[:, None], reference.bodies.ang_vel),
+    )
+    return dataclasses.replace(
+        reference,
+        bodies=bodies,
+        anchor_lin_acc=rotation.rotate(turn, reference.anchor_lin_acc),
+        anchor_ang_acc=rotation.rotate(turn, reference.anchor_ang_acc),
     )
