@@ -7,6 +7,7 @@ Unlearning via Quantization"). Only the actor is changed, since the critic does 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -34,7 +35,7 @@ def half_precision(weights: Array) -> Array:
     return weights.astype(jnp.bfloat16).astype(jnp.float32)
 
 
-def noisy(weights: Array, share: float, key: Array) -> Array:
+def noisy(share: float, weights: Array, key: Array) -> Array:
     """Weights with Gaussian noise of `share` of their own standard deviation."""
     return weights + share * weights.std() * jax.random.normal(key, weights.shape)
 
@@ -44,7 +45,7 @@ CHANGES: Mapping[str, Change] = {
     "bf16": lambda weights, key: half_precision(weights),
     "int8": lambda weights, key: quantised(weights, 8),
     "int4": lambda weights, key: quantised(weights, 4),
-    **{f"noise {share:.0%}": (lambda weights, key, share=share: noisy(weights, share, key)) for share in NOISES},
+    **{f"noise {share:.0%}": functools.partial(noisy, share) for share in NOISES},
 }
 
 

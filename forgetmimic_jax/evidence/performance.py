@@ -13,7 +13,7 @@ import numpy as np
 
 from forgetmimic_jax.evaluation import metrics, statistics
 from forgetmimic_jax.evaluation.document import Estimate
-from forgetmimic_jax.evaluation.metrics import BASE, ZERO_ACTION
+from forgetmimic_jax.evaluation.metrics import BASE, ZERO_ACTION, Rollout
 from forgetmimic_jax.evidence.document import Compared, Numbers
 
 LOWEST_CONTENT = -1.0
@@ -26,6 +26,7 @@ class Performance:
 
     names: tuple[str, ...]  # of the clips
     clip: np.ndarray  # i[E] index into names
+    start_frame: np.ndarray  # i[E]
     horizon: np.ndarray  # i[E] steps
     length: Mapping[str, np.ndarray]  # by policy, i[E] steps before the first termination; the horizon: success
     tracking: Mapping[str, np.ndarray]  # by policy, f[E, T] normalised tracking reward; unread past `length`
@@ -35,6 +36,10 @@ class Performance:
     def of(self, clips: Sequence[str]) -> np.ndarray:
         """bool[E] the episodes of some clips."""
         return np.isin(self.clip, [self.names.index(name) for name in clips])
+
+    def rollout(self, policy: str) -> Rollout:
+        """One policy's episodes as the metrics take them."""
+        return Rollout(self.clip, self.start_frame, self.horizon, self.length[policy], self.tracking[policy])
 
     def tracked(self, policy: str) -> np.ndarray:
         """f[E] survival-weighted tracking."""
@@ -121,8 +126,10 @@ def over_seeds(seeds: Sequence[Compared]) -> Compared:
     }
 
 
-def follows(performance: Performance, original: Performance, names: Mapping[str, str], share: float) -> dict[str, float]:
-    """The base's tracking on each variant as a share of its tracking on the original, of those where it is below `share`.
+def not_followed(
+    performance: Performance, original: Performance, names: Mapping[str, str], share: float
+) -> dict[str, float]:
+    """Where the base's tracking on a variant is below `share` of that on the original: variant → that ratio.
 
     Args:
         performance: on the variants.

@@ -28,7 +28,7 @@ def test_bfloat16_has_eight_bits_and_rounds_ties_to_even():
 
 def test_noise_is_a_share_of_the_layers_standard_deviation():
     weights = 5.0 * jax.random.normal(jax.random.PRNGKey(1), (200, 200)) + 1.0
-    noise = numerics.noisy(weights, 0.03, jax.random.PRNGKey(2)) - weights
+    noise = numerics.noisy(0.03, weights, jax.random.PRNGKey(2)) - weights
     assert float(noise.std()) == pytest.approx(0.03 * 5.0, rel=0.02)
     assert abs(float(noise.mean())) < 0.003
 
