@@ -1,31 +1,25 @@
 """Kept segments that look like a target, and others as hard that do not: is what was lost near the target alone?
 
-Segments are of one second. How alike two of them are is the dynamic time warping of their joint angles. Retention is
-from the tracking at every step of rollouts that were made anyway.
+Retention is from the tracking at every step of rollouts that were made anyway.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
-from forgetmimic_jax.evaluation.metrics import Rollout
-from forgetmimic_jax.motion.clip import Clip
+from forgetmimic_jax.evaluation import statistics
+from forgetmimic_jax.evaluation.document import Estimate
+from forgetmimic_jax.evaluation.metrics import BASE, Rollout
+from forgetmimic_jax.evidence.case import TRAINED, Case
+from forgetmimic_jax.evidence.document import LookAlike, LookAlikes
+from forgetmimic_jax.evidence.warping import Segment, distances
 
-SECONDS = 1.0  # of a segment; the next one starts half of it later
 NEAREST = 8  # segments compared
 FEWEST_EPISODES = 2  # that pass a segment
-
-
-@dataclass(frozen=True)
-class Segment:
-    """Frames first ≤ frame < end of a clip."""
-
-    clip: str
-    first: int
-    end: int
 
 
 @dataclass(frozen=True)
@@ -36,50 +30,6 @@ class Pair:
     far: Segment
     near_distance: float  # rad
     far_distance: float  # rad
-
-
-def warped_distance(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Dynamic time warping of pairs of motions, rad [pair].
-
-    The cost of two frames is the root mean square of their joint differences. A step in both motions counts twice, a
-    step in one of them once, and the least sum of costs is divided by the two lengths' sum (Sakoe and Chiba 1978,
-    symmetric form without a slope constraint): a mean cost.
-
-    Args:
-        one: [pair, frame, joint] rad.
-        other: [pair, frame', joint] rad.
-    """
-    cost = np.sqrt(((one[:, :, None] - other[:, None]) ** 2).mean(axis=-1))
-    pairs, rows, columns = cost.shape
-    total = np.full((pairs, rows + 1, columns + 1), np.inf)
-    total[:, 0, 0] = 0.0
-    for row in range(rows):
-        for column in range(columns):
-            here = cost[:, row, column]
-            before = np.minimum(total[:, row, column + 1], total[:, row + 1, column]) + here
-            total[:, row + 1, column + 1] = np.minimum(before, total[:, row, column] + 2.0 * here)
-    return total[:, -1, -1] / (rows + columns)
-
-
-def segments(clip: Clip) -> list[Segment]:
-    """The segments of a clip; of a clip shorter than one, the whole."""
-    length = min(round(SECONDS * clip.fps), clip.num_frames)
-    firsts = range(0, clip.num_frames - length + 1, max(1, length // 2))
-    return [Segment(clip.name, first, first + length) for first in firsts]
-
-
-def distances(kept: Sequence[Clip], targets: Sequence[Clip]) -> dict[Segment, float]:
-    """Every kept segment's distance to the nearest segment of any target, rad."""
-    theirs = [_joints(clip, segment, targets[0]) for clip in targets for segment in segments(clip)]
-    found = {}
-    for clip in kept:
-        for segment in segments(clip):
-            ours = _joints(clip, segment, targets[0])
-            found[segment] = min(
-                float(warped_distance(np.broadcast_to(ours, (len(alike), *ours.shape)), np.stack(alike)).min())
-                for alike in _by_length(theirs)
-            )
-    return found
 
 
 def matched(distance: Mapping[Segment, float], difficulty: Mapping[Segment, float], count: int = NEAREST) -> list[Pair]:
@@ -131,13 +81,50 @@ def tracking_in(rollouts: Mapping[str, Rollout], names: Sequence[str], segment: 
     }
 
 
-def _joints(clip: Clip, segment: Segment, like: Clip) -> np.ndarray:
-    """Joint angles [frame, joint] of a segment, in the order of another clip's joints."""
-    order = [clip.joint_names.index(joint) for joint in like.joint_names]
-    return clip.joint_pos[segment.first : segment.end, order]
+def retention(
+    pairs: Sequence[Pair], tracking: Mapping[Segment, Mapping[str, float]], policies: Sequence[str]
+) -> LookAlikes:
+    """Retention of the base's tracking near the targets and far from them, with intervals over the segments.
+
+    Args:
+        pairs: of segments.
+        tracking: per step on each of them, by policy.
+        policies: whose retention it is.
+    """
+
+    def kept(policy: str, segment: Segment) -> float:
+        return tracking[segment][policy] / tracking[segment][BASE]
+
+    def over(values: Iterable[float]) -> Estimate:
+        return msgspec.convert(statistics.over_seeds(list(values)), Estimate)
+
+    found = [
+        LookAlike(
+            near=str(pair.near),
+            far=str(pair.far),
+            distances=(pair.near_distance, pair.far_distance),
+            retention={policy: (kept(policy, pair.near), kept(policy, pair.far)) for policy in policies},
+        )
+        for pair in pairs
+    ]
+    return LookAlikes(
+        pairs=found,
+        near={policy: over(one.retention[policy][0] for one in found) for policy in policies if found},
+        far={policy: over(one.retention[policy][1] for one in found) for policy in policies if found},
+        difference={
+            policy: over(one.retention[policy][0] - one.retention[policy][1] for one in found)
+            for policy in policies
+            if found
+        },
+    )
 
 
-def _by_length(motions: Sequence[np.ndarray]) -> list[list[np.ndarray]]:
-    """Motions [frame, joint] of equal lengths together."""
-    lengths = dict.fromkeys(len(motion) for motion in motions)
-    return [[motion for motion in motions if len(motion) == length] for length in lengths]
+def attack(case: Case) -> LookAlikes:
+    """Retention on the kept segments nearest to the targets and on far ones, by every policy."""
+    performance, names = case.on_library, tuple(case.clips)
+    policies = [policy for policy in TRAINED if policy in case.policies]
+    rollouts = {policy: performance.rollout(policy) for policy in policies}
+    distance = distances(case.chosen(case.kept), case.chosen(case.targets))
+    tracking = {segment: tracking_in(rollouts, names, segment) for segment in distance}
+    difficulty = {segment: of[BASE] for segment, of in tracking.items() if of and of[BASE] > 0.0}
+    return retention(matched(distance, difficulty), tracking, policies)

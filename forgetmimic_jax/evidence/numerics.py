@@ -6,17 +6,25 @@ Unlearning via Quantization"). Only the actor is changed, since the critic does 
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
+import msgspec
+import numpy as np
 from jax import Array
 
-from forgetmimic_jax.policy.policy import Policy
+from forgetmimic_jax.evaluation import statistics
+from forgetmimic_jax.evaluation.document import Estimate
+from forgetmimic_jax.evaluation.metrics import UNLEARNED
+from forgetmimic_jax.evidence.case import Case
+from forgetmimic_jax.evidence.document import Numerics
+from forgetmimic_jax.evidence.performance import Performance, compare
+from forgetmimic_jax.evidence.rollouts import Actor
 
+P = TypeVar("P", bound=Actor)
 Change = Callable[[Array, Array], Array]  # a layer's weights [input, output] and a random key → the new weights
 
 
@@ -49,18 +57,48 @@ CHANGES: Mapping[str, Change] = {
 }
 
 
-def changed(policy: Policy, change: Change, seed: int = 0) -> Policy:
+def changed(policy: P, change: Change, seed: int = 0) -> P:
     """The policy with every layer of its actor changed; biases and exploration noise stay.
 
     Args:
-        policy: any.
+        policy: a `Policy`, or a pytree around one.
         change: of `CHANGES`.
         seed: of the noise.
     """
-    keys = iter(jax.random.split(jax.random.PRNGKey(seed), len(jax.tree.leaves(policy.actor))))
+    keys = iter(jax.random.split(jax.random.PRNGKey(seed), len(jax.tree.leaves(policy))))
 
     def layer(path: Any, weights: Array) -> Array:
-        key = next(keys)
-        return change(weights, key) if jax.tree_util.keystr(path[-1:], simple=True) == "kernel" else weights
+        key, place = next(keys), jax.tree_util.keystr(path, simple=True, separator="/").split("/")
+        return change(weights, key) if "actor" in place and place[-1] == "kernel" else weights
 
-    return dataclasses.replace(policy, actor=jax.tree_util.tree_map_with_path(layer, policy.actor))
+    return jax.tree_util.tree_map_with_path(layer, policy)
+
+
+def attack(case: Case) -> Numerics:
+    """Every change of every policy's weights on the targets, and of the unlearned policy's on the kept clips."""
+    policies = case.policies
+    versions = {
+        (name, change): changed(policy, make, case.seed)
+        for name, policy in policies.items()
+        for change, make in CHANGES.items()
+    }
+    words = {f"{name}, {change}": of for (name, change), of in versions.items()}
+    performance = case.on_targets.joined(case.target_stage.perform(words))
+    every = np.ones(len(performance.clip), bool)
+    against = {f"{name}, {change}": name for name, change in versions}
+    compared = compare(performance, every, against=against, seed=case.seed, policies=list(against))
+    stage = case.stage(case.chosen(case.kept), case.scale.kept_variant_episodes)
+    ours = {change: versions[UNLEARNED, change] for change in CHANGES}
+    on_kept = stage.perform({"before": case.policies[UNLEARNED], **ours})
+    success = {name: _success(on_kept, name) for name in on_kept.length}
+    return Numerics(
+        before=case.compare(case.on_targets, case.targets),
+        changes={change: {name: compared[f"{name}, {change}"] for name in policies} for change in CHANGES},
+        kept_before=success.pop("before"),
+        kept=success,
+    )
+
+
+def _success(performance: Performance, policy: str) -> Estimate:
+    success = performance.length[policy] == performance.horizon
+    return msgspec.convert(statistics.rate(int(success.sum()), len(success)), Estimate)

@@ -5,6 +5,7 @@ An episode's motion content is that of `evaluation.unbounded`; here it may be of
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -36,6 +37,15 @@ class Performance:
     def of(self, clips: Sequence[str]) -> np.ndarray:
         """bool[E] the episodes of some clips."""
         return np.isin(self.clip, [self.names.index(name) for name in clips])
+
+    def joined(self, other: Performance) -> Performance:
+        """With the policies of another performance on the same episodes."""
+        return dataclasses.replace(
+            self,
+            length={**self.length, **other.length},
+            tracking={**self.tracking, **other.tracking},
+            deviation={**self.deviation, **other.deviation},
+        )
 
     def rollout(self, policy: str) -> Rollout:
         """One policy's episodes as the metrics take them."""

@@ -12,7 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from forgetmimic_jax.evidence.variants import part, placed
+from forgetmimic_jax.evidence.case import Case
+from forgetmimic_jax.evidence.document import Compared, Splices
+from forgetmimic_jax.evidence.near_duplicates import FOLLOWED, part, placed
+from forgetmimic_jax.evidence.performance import compare, not_followed
 from forgetmimic_jax.motion.clip import Clip
 from forgetmimic_jax.motion.kinematics import quaternion, rotation
 
@@ -94,4 +97,33 @@ def joined(one: Clip, other: Clip, fade: int) -> Clip:
             )
         ),
         joint_pos=np.concatenate([one.joint_pos, joints + weight * (one.joint_pos[-1] - joints[0])]),
+    )
+
+
+def attack(case: Case) -> Splices:
+    """Target seconds inside kept clips, and kept seconds inside targets, by every policy."""
+    clips = case.clips
+    pairs = [(host, target) for target in case.targets for host in case.nearest[target][: case.scale.hosts]]
+    made = {"forbidden": [splice(clips[host], clips[target]) for host, target in pairs]}
+    made["kept"] = [splice(clips[target], clips[host]) for host, target in pairs]
+    every = made["forbidden"] + made["kept"]
+    hosts = [host for host, _ in pairs] + [target for _, target in pairs]
+    stage = case.stage([one.clip for one in every], case.scale.variant_episodes, from_start=True)
+    performance = stage.perform(case.everyone)
+    originals = {one.clip.name: host for one, host in zip(every, hosts, strict=True)}
+    dropped = not_followed(performance, case.on_library, originals, FOLLOWED)
+    # The step t tracks the frame t + 1.
+    first, end = (np.array(ends)[performance.clip] - 1 for ends in zip(*((s.first, s.end) for s in every), strict=True))
+
+    def compared(splices: list[Splice]) -> Compared:
+        members = performance.of([one.clip.name for one in splices if one.clip.name not in dropped])
+        if not members.any():
+            return {}
+        return compare(performance, members, against=case.against, seed=case.seed, window=(first, end))
+
+    return Splices(
+        forbidden=compared(made["forbidden"]),
+        kept=compared(made["kept"]),
+        splices={one.clip.name: compared([one]) for one in every if one.clip.name not in dropped},
+        dropped=dropped,
     )

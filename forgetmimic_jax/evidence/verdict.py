@@ -12,6 +12,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
+import msgspec
+
 from forgetmimic_jax.evaluation.document import Estimate
 from forgetmimic_jax.evaluation.metrics import UNLEARNED
 from forgetmimic_jax.evaluation.relearning import Lasted, lasted
@@ -194,16 +196,7 @@ def _pace(relearning: Relearning | None) -> tuple[bool | None, str]:
 
 def paired(relearning: Relearning) -> dict[str, tuple[Lasted, Lasted]]:
     """By seed, how long the unlearned policy and the control took to relearn the targets."""
-    results = {
-        "base": relearning.base,
-        "starts": {
-            start: {
-                seed: {name: getattr(curve, name) for name in ("iterations", "tracking", "target_steps")}
-                for seed, curve in curves.items()
-            }
-            for start, curves in relearning.starts.items()
-        },
-    }
+    results = msgspec.to_builtins(relearning)
     ours, theirs = (lasted(results, start, RELEARNED) for start in (UNLEARNED, CONTROL))
     return {seed: (ours[seed], theirs[seed]) for seed in ours if seed in theirs}
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from forgetmimic_jax.evaluation.metrics import Rollout
-from forgetmimic_jax.evidence import look_alikes
-from forgetmimic_jax.evidence.look_alikes import Pair, Segment
+from forgetmimic_jax.evidence import look_alikes, warping
+from forgetmimic_jax.evidence.look_alikes import Pair
+from forgetmimic_jax.evidence.warping import Segment
 from forgetmimic_jax.motion.clip import Clip
 
 
@@ -34,18 +35,18 @@ def clip(name: str, joints: np.ndarray) -> Clip:
     ],
 )
 def test_warped_distance_by_hand(one, other, distance):
-    assert look_alikes.warped_distance(motion(*one), motion(*other)) == pytest.approx([distance])
+    assert warping.warped_distance(motion(*one), motion(*other)) == pytest.approx([distance])
 
 
 def test_a_frames_cost_is_the_root_mean_square_over_joints():
     one, other = np.zeros((1, 1, 2)), np.array([[[3.0, 4.0]]])
-    assert look_alikes.warped_distance(one, other) == pytest.approx([np.sqrt(12.5)])
+    assert warping.warped_distance(one, other) == pytest.approx([np.sqrt(12.5)])
 
 
 def test_warped_distance_is_that_of_a_plain_recursion():
     random = np.random.default_rng(0)
     one, other = random.standard_normal((3, 6, 4)), random.standard_normal((3, 5, 4))
-    found = look_alikes.warped_distance(one, other)
+    found = warping.warped_distance(one, other)
     for pair in range(3):
 
         @functools.cache
@@ -60,15 +61,15 @@ def test_warped_distance_is_that_of_a_plain_recursion():
 
 
 def test_segments_of_a_second_overlap_by_half():
-    assert look_alikes.segments(clip("long", np.zeros(110))) == [
+    assert warping.segments(clip("long", np.zeros(110))) == [
         Segment("long", 0, 50), Segment("long", 25, 75), Segment("long", 50, 100)
     ]  # fmt: skip
-    assert look_alikes.segments(clip("short", np.zeros(20))) == [Segment("short", 0, 20)]
+    assert warping.segments(clip("short", np.zeros(20))) == [Segment("short", 0, 20)]
 
 
 def test_a_kept_segments_distance_is_to_the_nearest_target():
     targets = [clip("t1", np.full(50, 1.0)), clip("t2", np.full(20, 4.0))]
-    found = look_alikes.distances([clip("kept", np.r_[np.full(50, 1.5), np.full(50, 3.8)])], targets)
+    found = warping.distances([clip("kept", np.r_[np.full(50, 1.5), np.full(50, 3.8)])], targets)
     assert found[Segment("kept", 0, 50)] == pytest.approx(0.5)
     assert found[Segment("kept", 50, 100)] == pytest.approx(0.2)
 

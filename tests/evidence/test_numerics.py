@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from trees import assert_same
 
 from forgetmimic_jax.evidence import numerics
 from forgetmimic_jax.policy.policy import init_policy
@@ -42,7 +43,7 @@ def test_layers_of_the_actor_change_and_nothing_else(name):
         kernel = "kernel" in jax.tree_util.keystr(path)
         assert bool(jnp.array_equal(old, new)) != kernel, path
     for part in ("critic", "actor_normalizer", "critic_normalizer"):
-        assert getattr(found, part) is getattr(policy, part)
+        assert_same(getattr(found, part), getattr(policy, part))
 
 
 def test_every_layer_has_noise_of_its_own():

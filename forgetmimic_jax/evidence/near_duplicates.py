@@ -12,6 +12,9 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
+from forgetmimic_jax.evidence.case import Case
+from forgetmimic_jax.evidence.document import Compared, NearDuplicates
+from forgetmimic_jax.evidence.performance import Performance, not_followed
 from forgetmimic_jax.motion.clip import Clip
 from forgetmimic_jax.motion.fit import on_floor
 from forgetmimic_jax.motion.kinematics import quaternion, resample, rotation
@@ -24,6 +27,8 @@ TURN = np.pi / 2  # rad
 NOISE = 0.05  # rad, root mean square of every joint's noise
 CUT_OFF = 2.0  # Hz, of the noise
 BLEND = 0.75  # share of the clip in its blend with another
+FOLLOWED = 0.5  # of the base's tracking on the original: below it a variant is dropped
+KEPT_SPEEDS = (0.9, 1.1)
 
 Families = Mapping[str, list[Clip]]
 
@@ -40,14 +45,13 @@ def near_duplicates(robot: Robot, clip: Clip, other: Clip, seed: int = 0) -> Fam
         other: a clip at the same rate for the blend, a kept one.
         seed: of the noise.
     """
-    halves = clip.num_frames // 2
     return {
         "speed": [at_speed(clip, factor) for factor in SPEEDS],
         "mirrored": [mirrored(robot, clip)],
         "amplitude": [as_high(robot, with_amplitude(robot, clip, factor), clip) for factor in AMPLITUDES],
         "turned": [turned(clip, TURN)],
         "noise": [as_high(robot, with_noise(robot, clip, NOISE, CUT_OFF, seed), clip)],
-        "half": [part(clip, 0, halves, "first_half"), part(clip, halves, clip.num_frames, "second_half")],
+        "half": [first_half(clip), second_half(clip)],
         "blended": [as_high(robot, blended(clip, other, BLEND), clip)],
     }
 
@@ -103,6 +107,16 @@ def part(clip: Clip, first: int, end: int, name: str) -> Clip:
     )
 
 
+def first_half(clip: Clip) -> Clip:
+    """The frames before the middle."""
+    return part(clip, 0, clip.num_frames // 2, "first_half")
+
+
+def second_half(clip: Clip) -> Clip:
+    """The frames from the middle on."""
+    return part(clip, clip.num_frames // 2, clip.num_frames, "second_half")
+
+
 def blended(clip: Clip, other: Clip, share: float) -> Clip:
     """`share` of the clip and the rest of another one, frame by frame, as long as the shorter of the two.
 
@@ -148,3 +162,53 @@ def _with_joints(robot: Robot, clip: Clip, joint_pos: np.ndarray, name: str) -> 
     order = [robot.joint_names.index(joint) for joint in clip.joint_names]
     limited = np.clip(joint_pos, robot.joint_lower[order], robot.joint_upper[order])
     return dataclasses.replace(clip, name=f"{clip.name}_{name}", joint_pos=limited)
+
+
+def attack(case: Case) -> NearDuplicates:
+    """Every near-duplicate of the targets, and a few of the kept clips, by every policy."""
+    robot, clips = case.setup.robot, case.clips
+    families: dict[str, list[str]] = {}
+    originals: dict[str, str] = {}
+    made: list[Clip] = []
+    for target in case.targets:
+        blended_with = clips[case.nearest[target][0]]
+        for family, variants in near_duplicates(robot, clips[target], blended_with, case.seed).items():
+            families.setdefault(family, []).extend(variant.name for variant in variants)
+            originals |= {variant.name: target for variant in variants}
+            made += variants
+    performance = case.stage(made, case.scale.variant_episodes).perform(case.everyone)
+    dropped = not_followed(performance, case.on_targets, originals, FOLLOWED)
+    kept, kept_dropped = _of_kept(case)
+    return NearDuplicates(
+        families=_compared(case, performance, families, dropped),
+        variants={name: case.compare(performance, [name]) for name in originals if name not in dropped},
+        dropped=dropped | kept_dropped,
+        kept=kept,
+    )
+
+
+def _of_kept(case: Case) -> tuple[dict[str, Compared], dict[str, float]]:
+    """The kept clips at other speeds and with noise: a policy that falls on all that is unfamiliar cannot do them."""
+    robot = case.setup.robot
+    families: dict[str, list[str]] = {"speed": [], "noise": []}
+    originals: dict[str, str] = {}
+    made: list[Clip] = []
+    for name in case.kept:
+        clip = case.clips[name]
+        variants = {"speed": [at_speed(clip, factor) for factor in KEPT_SPEEDS]}
+        variants["noise"] = [as_high(robot, with_noise(robot, clip, NOISE, CUT_OFF, case.seed), clip)]
+        for family, those in variants.items():
+            families[family] += [variant.name for variant in those]
+            originals |= {variant.name: name for variant in those}
+            made += those
+    performance = case.stage(made, case.scale.kept_variant_episodes).perform(case.everyone)
+    dropped = not_followed(performance, case.on_library, originals, FOLLOWED)
+    return _compared(case, performance, families, dropped), dropped
+
+
+def _compared(
+    case: Case, performance: Performance, families: Mapping[str, list[str]], dropped: Mapping[str, float]
+) -> dict[str, Compared]:
+    """The numbers of each family over the variants that are left."""
+    left = {family: [name for name in names if name not in dropped] for family, names in families.items()}
+    return {family: case.compare(performance, names) for family, names in left.items() if names}
