@@ -168,7 +168,7 @@ def read_evidence(path: Path) -> EvidenceDocument:
         raise InputError(f"{path}: not evidence, or damaged: {type(error).__name__}: {error}") from None
 
 
-def write_document(path: Path, document: msgspec.Struct) -> None:
+def write_document(path: Path, document: object) -> None:
     """Write a document, or an attack's part of one, to a file, which appears whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
     content = msgspec.to_builtins(document)

@@ -196,9 +196,14 @@ def _pace(relearning: Relearning | None) -> tuple[bool | None, str]:
 
 def paired(relearning: Relearning) -> dict[str, tuple[Lasted, Lasted]]:
     """By seed, how long the unlearned policy and the control took to relearn the targets."""
+    runs = lasted_until(relearning, RELEARNED)
+    return {seed: (run, runs[CONTROL][seed]) for seed, run in runs[UNLEARNED].items() if seed in runs[CONTROL]}
+
+
+def lasted_until(relearning: Relearning, share: float) -> dict[str, dict[str, Lasted]]:
+    """How long the unlearned policy and the control took to a share of the base's tracking: policy → seed → run."""
     results = msgspec.to_builtins(relearning)
-    ours, theirs = (lasted(results, start, RELEARNED) for start in (UNLEARNED, CONTROL))
-    return {seed: (ours[seed], theirs[seed]) for seed in ours if seed in theirs}
+    return {start: lasted(results, start, share) for start in (UNLEARNED, CONTROL)}
 
 
 def _control_is_usable(evidence: EvidenceDocument) -> str:
