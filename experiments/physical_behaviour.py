@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from experiments.validity import LENGTH, NO_FURTHER_OFF, SOONER
-from forgetmimic_jax.evaluation import metrics, statistics
+from forgetmimic_jax.evaluation import metrics, statistics, tables
 from forgetmimic_jax.evaluation.plots import new_figure
 from forgetmimic_jax.evaluation.statistics import Estimate
-from forgetmimic_jax.evaluation.tables import UNITS, markdown_table, number
+from forgetmimic_jax.evaluation.tables import UNITS, markdown_table, number, percent
 from forgetmimic_jax.studies.claim import Finding, finding
 from forgetmimic_jax.studies.conduct import main
 from forgetmimic_jax.studies.lab import Lab, newest_policy
@@ -51,7 +51,13 @@ def measure(lab: Lab) -> dict[str, Any]:
         values = metrics.episode_metrics(rollout, common)
         shown = [*MEASURES, *(name + metrics.COMMON for name in ERRORS)]
         result.setdefault(label, {})[str(seed)] = {name: values[name][on_target].round(5).tolist() for name in shown}
-    return {"policies": result}
+    without_end: dict[str, Any] = {}
+    for (label, seed), numbers in lab.unbounded(policies).items():
+        without_end.setdefault(label, {})[str(seed)] = {
+            name: [None if np.isnan(value) else round(float(value), 5) for value in values]
+            for name, values in numbers.items()
+        }
+    return {"policies": result, "unbounded": without_end}
 
 
 def over_runs(policies: Document, label: str, name: str) -> Estimate:
@@ -79,7 +85,42 @@ def body(document: Document) -> str:
         "every policy survives. Paper (another library and budget): length 500 to 8-13 steps, anchor position error "
         "0.576 to 0.053-0.055 m, foot contact 0.94 to 0.40-0.56, joint limit violation 0.12 to 0.26.\n"
     )
-    return f"{markdown_table(['', *policies], rows)}\n{note}"
+    return f"{markdown_table(['', *policies], rows)}\n{note}{unbounded_table(document['results'].get('unbounded', {}))}"
+
+
+def unbounded_table(policies: Document) -> str:
+    """What the robot does on the targets without terminations; nothing for older results.
+
+    A run's number is the mean over the episodes in which it is defined.
+    """
+    if not policies:
+        return ""
+    rows = []
+    for name, label in tables.UNBOUNDED.items():
+        source = "impact_force" if name.startswith("impact_force") else name
+        cells = []
+        for runs in policies.values():
+            values = [[value for value in run[source] if value is not None] for run in runs.values()]
+            defined = [reduced(name, of) for of in values if of]
+            rate = name.endswith("_rate")
+            high = 1.0 if rate or "share" in label else np.inf
+            estimate = within(statistics.over_seeds(defined), -1.0 if name == "motion_content" else 0.0, high)
+            cells.append((percent(estimate) if rate else number(estimate, 2)) if defined else "")
+        rows.append([label, *cells])
+    note = (
+        "The targets without terminations, to the clip's end and 3 s longer with its last frame held, and with "
+        "self-collision. `docs/method.md` defines the numbers.\n"
+    )
+    return f"\n**Without terminations**\n\n{markdown_table(['', *policies], rows)}\n{note}"
+
+
+def reduced(name: str, values: Sequence[float]) -> float:
+    """A number of one run from its episodes."""
+    if name == "impact_force_median":
+        return float(np.quantile(values, 0.5, method="inverted_cdf"))
+    if name == "impact_force_95":
+        return float(np.quantile(values, 0.95, method="inverted_cdf"))
+    return float(np.mean(values))
 
 
 def findings(document: Document) -> Iterator[Finding]:

@@ -65,6 +65,7 @@ def main(options: Options) -> None:
         "done": facts.done(subject),
         "cards": facts.cards(subject),
         "threshold": facts.threshold(subject),
+        "instead": facts.instead(subject),
         "notes": tables.notes(subject.document),
         "rules": RULES,
         "limits": facts.limits(subject, control, relearning),

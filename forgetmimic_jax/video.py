@@ -11,14 +11,15 @@ from forgetmimic_jax.basics.errors import InputError, nearest, run_command
 from forgetmimic_jax.settings.options import at_least, comma_separated, parse
 
 if TYPE_CHECKING:
-    from forgetmimic_jax.viewing.side_by_side import Episode
+    from forgetmimic_jax.viewing.takes import Episode
 
 
 @dataclass
 class Options:
     """Film one episode of each clip, base beside unlearned policy, and put stills of all clips on one page.
 
-    The episodes start at the clips' first frames and follow the evaluation's protocol on MuJoCo's C engine.
+    The episodes start at the clips' first frames. No termination ends them, and a target goes on for 3 s after its end
+    with the last frame held. Else the protocol is the evaluation's, on MuJoCo's C engine.
     """
 
     robot: str = "g1"
@@ -27,10 +28,12 @@ class Options:
     """Checkpoint folder, such as an unlearning run's; the shipped base data/ROBOT/base by default."""
     base: Path | None = None
     """For an unlearned checkpoint, the base beside it; the one it started from by default."""
+    beside: str | None = None
+    """More checkpoints to film beside these, comma-separated; each is named by its method."""
     clips: str | None = None
     """Clips to film, comma-separated; all of the library by default."""
     seconds: float = 10.0
-    """Longest film, s; a film ends sooner where the clip does, or once every policy has lost the motion."""
+    """Longest film, s; a film ends sooner where the clip does, or 3 s later if it is to be forgotten."""
     stills: int = 6
     """Pictures of each clip on the page of stills, from its start to its end."""
     seed: int = 0
@@ -52,7 +55,7 @@ def main(options: Options) -> None:
     from forgetmimic_jax.training.start import base_folder
     from forgetmimic_jax.viewing import film
     from forgetmimic_jax.viewing.offscreen import check_rendering
-    from forgetmimic_jax.viewing.side_by_side import record
+    from forgetmimic_jax.viewing.takes import record
 
     at_least(1, "--stills", options.stills)
     at_least(0, "--seed", options.seed)
@@ -62,7 +65,14 @@ def main(options: Options) -> None:
     run = folder_of(path)
     output = options.output or (run / "videos" if run else Path("runs") / f"video-{options.robot}")
     check_writable(output)
-    compared = load_comparison(path, robot=options.robot, base=options.base, library=options.library, physics="native")
+    compared = load_comparison(
+        path,
+        robot=options.robot,
+        base=options.base,
+        beside=[Path(one) for one in comma_separated(options.beside or "")],
+        library=options.library,
+        physics="native",
+    )
     setup = compared.setup
     clips = setup.library.names if options.clips is None else comma_separated(options.clips)
     if not clips:
@@ -71,15 +81,14 @@ def main(options: Options) -> None:
         if clip not in setup.library.names:
             raise InputError(f"--clips: no clip '{clip}' in the library; {nearest(clip, setup.library.names)}")
     check_rendering()
-    episodes = record(setup, compared.policies, clips, seed=options.seed)
+    episodes = record(setup, compared.policies, clips, compared.targets, seed=options.seed)
     output.mkdir(parents=True, exist_ok=True)
     sheet, drawn = [], 0
     total = sum(len(film.shown_steps(episode, seconds=options.seconds)) for episode in episodes)
     with film.pane_renderer(options.robot) as renderer, progress("draw", total) as report:
         for episode in episodes:
             frames = []
-            target = episode.clip in compared.targets
-            for frame in film.render_clip(renderer, episode, target=target, seconds=options.seconds):
+            for frame in film.render_clip(renderer, episode, seconds=options.seconds):
                 frames.append(frame)
                 drawn += 1
                 report(drawn, 0, {})
@@ -87,25 +96,27 @@ def main(options: Options) -> None:
             write_atomically(output / f"{episode.clip}.gif", film.gif(frames))
             sheet.append(film.stills(frames, options.stills))
     write_atomically(output / "contact_sheet.png", film.contact_sheet(sheet))
-    Console().print(_table(episodes, compared.targets))
+    Console().print(_table(episodes))
     files = {"films": output / "*.mp4", "for pages": output / "*.gif", "all clips": output / "contact_sheet.png"}
     closing(files, command_line("play", robot=options.robot, checkpoint=options.checkpoint))
 
 
-def _table(episodes: Sequence[Episode], targets: Sequence[str]):
+def _table(episodes: Sequence[Episode]):
     """What happened in each film."""
     from rich import box
     from rich.table import Table
+
+    from forgetmimic_jax.viewing.takes import at
 
     table = Table(title="One episode a clip", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     for column in ("clip", "role", *(f"{name}: tracking" for name in episodes[0].takes)):
         table.add_column(column, justify="left" if column in ("clip", "role") else "right")
     for episode in episodes:
         cells = []
-        for take in episode.takes.values():
-            lost = "" if take.ended is None else f", lost the motion at {take.ended / episode.fps:.2f} s"
-            cells.append(f"{take.survival_weighted_tracking:.2f}{lost}")
-        table.add_row(episode.clip, "target" if episode.clip in targets else "kept", *cells)
+        for name, take in episode.takes.items():
+            words = filter(None, at(episode, name, len(take.impact)))
+            cells.append(", ".join([f"{take.survival_weighted_tracking:.2f}", *words]))
+        table.add_row(episode.clip, "target" if episode.target else "kept", *cells)
     return table
 
 

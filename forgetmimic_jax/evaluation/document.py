@@ -34,6 +34,32 @@ class Estimate(msgspec.Struct, frozen=True, omit_defaults=True):
     n: int = 0
 
 
+class UnboundedNumbers(msgspec.Struct, kw_only=True, omit_defaults=True):
+    """What a robot did in episodes that no termination ends; `docs/method.md` defines each. None: undefined."""
+
+    upright_rate: Estimate | None = None
+    safe_rate: Estimate | None = None
+    time_to_fall: Estimate | None = None  # s
+    impact_force_median: Estimate | None = None  # body weights
+    impact_force_95: Estimate | None = None  # body weights, the 95th percentile
+    impact_rate: Estimate | None = None  # share of episodes above one body weight
+    impact_speed: Estimate | None = None  # m/s
+    head_contact_rate: Estimate | None = None
+    hand_contact_rate: Estimate | None = None
+    torque_saturation: Estimate | None = None
+    joint_limit_violation: Estimate | None = None
+    joint_speed_violation: Estimate | None = None
+    motion_content: Estimate | None = None
+    attempt_rate: Estimate | None = None
+
+
+class UnboundedResult(msgspec.Struct, kw_only=True):
+    """The same over all starts, and over those from a clip's first frame."""
+
+    all_starts: UnboundedNumbers
+    from_frame_0: UnboundedNumbers
+
+
 class GroupResult(msgspec.Struct, kw_only=True, omit_defaults=True):
     """One policy's numbers over the episodes of some clips; `docs/method.md` defines each.
 
@@ -46,6 +72,7 @@ class GroupResult(msgspec.Struct, kw_only=True, omit_defaults=True):
     episode_length: Estimate
     skill: Estimate | None = None  # signed; None where the base is hardly better than the zero-action baseline
     retention: Estimate | None = None
+    unbounded: UnboundedResult | None = None  # of targets; absent in older files
     errors: dict[str, Estimate] = {}
 
     def metric(self, name: str) -> Estimate | None:

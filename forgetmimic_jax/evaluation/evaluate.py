@@ -9,6 +9,7 @@ from typing import NamedTuple
 from forgetmimic_jax.basics.console import progress
 from forgetmimic_jax.basics.files import write_atomically
 from forgetmimic_jax.basics.provenance import made_here
+from forgetmimic_jax.evaluation import unbounded
 from forgetmimic_jax.evaluation.document import FILE, SCHEMA, EvaluationDocument, write_evaluation
 from forgetmimic_jax.evaluation.metrics import ZERO_ACTION
 from forgetmimic_jax.evaluation.rollout import Evaluator
@@ -35,7 +36,7 @@ def evaluate(
     episodes: int,
     seed: int,
 ) -> EvaluationDocument:
-    """The evaluation of policies and of the zero-action baseline on the same episodes.
+    """The evaluation of policies and of the zero-action baseline on the same episodes; see `rollout`, `unbounded`.
 
     Args:
         setup: robot, clips and settings.
@@ -53,6 +54,10 @@ def evaluate(
         for done, (name, policy) in enumerate(everyone.items(), start=1):
             rollouts[name] = evaluator.rollout(policy)
             report(done, sum(int(rollout.length.sum()) for rollout in rollouts.values()), {})
+    policies = evaluate_policies(rollouts, setup.library.names, targets, seed=seed)
+    if targets:
+        instead = unbounded.roll_out(setup, everyone, targets, episodes=episodes, seed=seed)
+        unbounded.add_numbers(policies, instead, setup.library.names, seed=seed)
     return EvaluationDocument(
         schema=SCHEMA,
         robot=setup.robot.name,
@@ -62,7 +67,7 @@ def evaluate(
         seed=seed,
         episodes=episodes,
         targets=list(targets),
-        policies=evaluate_policies(rollouts, setup.library.names, targets, seed=seed),
+        policies=policies,
         budget={name: {"environment_steps": subject.environment_steps} for name, subject in subjects.items()},
         made=made_here(),
         policy_hashes={name: subject.policy_hash for name, subject in subjects.items()},

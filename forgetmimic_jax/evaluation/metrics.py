@@ -12,6 +12,8 @@ import numpy as np
 
 BASE, UNLEARNED, FINE_TUNED, ZERO_ACTION = "base", "unlearned", "fine_tuned", "zero_action"
 MINIMUM_SKILL_RANGE = 0.05  # skill is undefined where the base is less than this above the zero-action baseline
+HOLD_SECONDS = 3.0  # s that an episode without terminations lasts after its horizon; a clip's last frame is held
+LOWEST_CONTENT = -1.0  # motion content is not less
 COMMON = "_common"  # suffix of an error averaged over the steps that every compared policy survives
 
 

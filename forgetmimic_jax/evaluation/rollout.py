@@ -14,6 +14,7 @@ from jax import Array
 
 from forgetmimic_jax.basics import rotation
 from forgetmimic_jax.evaluation.metrics import Rollout
+from forgetmimic_jax.physics.engine import CONTACT_FORCE
 from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.robot.model import Robot
 from forgetmimic_jax.settings.config import Config
@@ -24,7 +25,6 @@ from forgetmimic_jax.tracking.setup import Setup
 
 CHUNK = 50  # control steps between two looks whether every episode has ended
 SHORTEST_START = 25  # a start frame leaves at least so many steps, so that no episode is trivially short
-CONTACT_FORCE = 1.0  # N, above which a foot counts as standing
 
 
 class Evaluator:

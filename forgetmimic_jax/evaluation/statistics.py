@@ -69,6 +69,28 @@ def bootstrap_mean(values: np.ndarray, weights: np.ndarray) -> Estimate:
     return estimate(np.mean(values), *_percentiles(resampled_mean(values, weights)), std, len(values))
 
 
+def bootstrap_quantile(values: np.ndarray, weights: np.ndarray, share: float) -> Estimate:
+    """The least of `values` f[E] that at least `share` of them do not exceed, with its percentile interval.
+
+    Args:
+        values: one an episode.
+        weights: f[resample, E] of whole strata.
+        share: 0.5 is the median.
+    """
+
+    def quantile(of: np.ndarray) -> np.ndarray:
+        total = np.cumsum(of[:, order], axis=1)
+        reached = total >= share * total[:, -1:] - 1e-4  # the sums of float32 weights
+        return values[order][reached.argmax(axis=1)]
+
+    order = np.argsort(values)
+    point = float(quantile(np.ones((1, len(values))))[0])
+    if np.isnan(weights).any():
+        return estimate(point, np.nan, np.nan, np.nan, len(values))
+    resampled = quantile(weights)
+    return estimate(point, *_percentiles(resampled), np.std(resampled), len(values))
+
+
 def bootstrap_of_means(
     function: Callable[..., np.ndarray], *samples: tuple[np.ndarray, np.ndarray], n: int
 ) -> Estimate:

@@ -21,8 +21,8 @@ from rich.text import Text
 
 from forgetmimic_jax.basics.errors import InputError, run_command
 from forgetmimic_jax.evaluation import statistics
-from forgetmimic_jax.evaluation.document import Estimate, EvaluationDocument, read_evaluation
-from forgetmimic_jax.evaluation.metrics import BASE, FINE_TUNED, UNLEARNED, ZERO_ACTION
+from forgetmimic_jax.evaluation.document import Estimate, EvaluationDocument, GroupResult, read_evaluation
+from forgetmimic_jax.evaluation.metrics import BASE, FINE_TUNED, HOLD_SECONDS, UNLEARNED, ZERO_ACTION
 
 POLICY_ORDER = (BASE, UNLEARNED, "retrained", FINE_TUNED, ZERO_ACTION)
 
@@ -39,6 +39,23 @@ UNITS = {
     "joint_limit_violation": "share",
 }  # every other error is a distance in m
 
+UNBOUNDED = {
+    "upright_rate": "upright until the end",
+    "safe_rate": "safe: upright, no impact above one body weight",
+    "time_to_fall": "time until the first fall, s",
+    "impact_force_median": "largest impact, median, body weights",
+    "impact_force_95": "largest impact, 95th percentile, body weights",
+    "impact_rate": "impact above one body weight",
+    "impact_speed": "root's speed downward before the first impact, m/s",
+    "head_contact_rate": "the head touches the floor",
+    "hand_contact_rate": "a hand touches the floor",
+    "torque_saturation": "torque above 95 % of its limit, share",
+    "joint_limit_violation": "joint beyond its soft limits, share",
+    "joint_speed_violation": "joint faster than its motor, share",
+    "motion_content": "motion content",
+    "attempt_rate": "attempts the clip: motion content above 0.3",
+}  # numbers of episodes that no termination ends
+
 BLOCK = re.compile(r"(<!-- evaluation:start (?P<path>\S+) -->\n).*?(<!-- evaluation:end -->)", re.DOTALL)
 
 
@@ -53,15 +70,16 @@ class Rows:
 
 def render_table(document: EvaluationDocument) -> RenderableType:
     """What was forgotten and what was kept, at one glance, for `rich.console.Console.print`."""
-    clips, groups = _clip_rows(document, digits=2, interval=False), _group_rows(document, digits=2)
-    return Group(_rich(clips), _rich(groups), Text("\n".join(notes(document)), style="dim"))
+    tables = [_clip_rows(document, digits=2, interval=False), _group_rows(document, digits=2)]
+    tables += unbounded_in_brief(document)
+    return Group(*map(_rich, tables), Text("\n".join(notes(document)), style="dim"))
 
 
 def markdown(document: EvaluationDocument) -> str:
     """evaluation.md: the whole document, with the conditions it was measured under."""
     targets = ", ".join(document.targets) or "none"
     lines = [f"# Evaluation: {document.robot}, targets: {targets}", "", *_conditions(document), ""]
-    lines += [markdown_tables(document), _markdown(_error_rows(document))]
+    lines += [markdown_tables(document), *map(_markdown, unbounded_tables(document)), _markdown(_error_rows(document))]
     return "\n".join(lines)
 
 
@@ -92,6 +110,46 @@ def fill(text: str, directory: Path) -> str:
         return f"{block[1]}{source}\n\n{_summary(document)}\n{block[3]}"
 
     return BLOCK.sub(tables, text)
+
+
+def unbounded_tables(document: EvaluationDocument) -> list[Rows]:
+    """What the robot did on the targets in episodes that no termination ends; nothing for an older document.
+
+    A table over all starts of all targets, one over the starts from frame 0, and one a target where there are several.
+    """
+    order = policy_order(document)
+    policies = [document.policies[name] for name in order]
+    if any(policy.target is None or policy.target.unbounded is None for policy in policies):
+        return []
+
+    def rows(groups: Sequence[GroupResult | None], starts: str) -> list[list[str]]:
+        of = [getattr(group.unbounded, starts) if group else None for group in groups]
+        return [
+            [label, *((percent if name.endswith("_rate") else number)(getattr(numbers, name, None)) for numbers in of)]
+            for name, label in UNBOUNDED.items()
+        ]
+
+    targets = [policy.target for policy in policies]
+    tables = {"all starts": rows(targets, "all_starts"), "from frame 0": rows(targets, "from_frame_0")}
+    if len(document.targets) > 1:
+        for clip in document.targets:
+            tables[f"{clip}, all starts"] = rows([policy.clips[clip] for policy in policies], "all_starts")
+    return [
+        Rows(f"Targets without terminations, {what}", ["", *map(_words, order)], found)
+        for what, found in tables.items()
+    ]
+
+
+def unbounded_in_brief(document: EvaluationDocument) -> list[Rows]:
+    """Three of the numbers, over all starts and from frame 0, in one table; nothing for an older document."""
+    tables = unbounded_tables(document)
+    if not tables:
+        return []
+    every, first = tables[:2]
+    labels = [UNBOUNDED[name] for name in ("upright_rate", "impact_rate", "motion_content")]
+    rows = [row for row in every.rows if row[0] in labels]
+    rows += [[f"{row[0]}, from frame 0", *row[1:]] for row in first.rows if row[0] in labels]
+    return [Rows("Targets without terminations", every.header, rows)]
 
 
 def policy_order(document: EvaluationDocument) -> list[str]:
@@ -232,6 +290,12 @@ def notes(document: EvaluationDocument) -> list[str]:
             f"result: forgotten at a skill of at most {100 * FORGOTTEN:.0f} %, kept at one of at least "
             f"{100 * KEPT:.0f} %, not learned where the base itself is hardly better than the baseline."
         )
+    if unbounded_in_brief(document):
+        lines.append(
+            f"targets without terminations: each target is played to its end and {HOLD_SECONDS:g} s longer with its "
+            f"last frame held, whatever the robot does. Its bodies also collide with each other, unlike in training."
+        )
+        lines.append("upright: no fall until then. motion content: 1 is the whole clip, 0 what a standing robot shows.")
     resets = {name: policy.nan_resets for name, policy in document.policies.items() if policy.nan_resets}
     if resets:
         counts = ", ".join(f"{_words(name)} {count}" for name, count in resets.items())

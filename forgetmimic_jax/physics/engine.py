@@ -17,6 +17,8 @@ from forgetmimic_jax.basics import rotation
 from forgetmimic_jax.robot.bodies import Bodies
 from forgetmimic_jax.robot.model import CONTACT_SENSOR, Robot
 
+CONTACT_FORCE = 1.0  # N, above which a body counts as touching the floor
+
 
 @struct.dataclass
 class PhysicsState:

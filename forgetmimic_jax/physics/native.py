@@ -22,7 +22,7 @@ from forgetmimic_jax.physics.engine import (
 )
 from forgetmimic_jax.robot.model import Robot
 
-_VELOCITY_STAGE = int(mujoco.mjtStage.mjSTAGE_VEL)
+VELOCITY_STAGE = int(mujoco.mjtStage.mjSTAGE_VEL)
 
 
 class NativeEngine:
@@ -59,20 +59,13 @@ class NativeEngine:
         self._state_shapes = (shape(model.nq), shape(model.nv), shape(model.nv))
         self._body_shapes = (shape(keys, 3), shape(keys, 4), shape(keys, 6), shape(3))
         self._force_shape = shape(keys, 3)
+        self._seen_shapes: tuple[jax.ShapeDtypeStruct, ...] = ()
 
     def step(
         self, state: PhysicsState, parameters: PhysicsParameters, joint_target: Array, wrench: Array
     ) -> tuple[PhysicsState, BodyState]:
         """See `Engine.step`."""
-        shapes = (*self._state_shapes, *self._body_shapes, self._force_shape)
-        loaded = (state.qpos, state.qvel, state.warmstart, parameters.foot_friction, parameters.torso_com)
-        qpos, qvel, warmstart, xpos, xquat, cvel, com, force = jax.pure_callback(
-            self._step_host,
-            shapes,
-            (*loaded, joint_target, wrench),
-            vmap_method="sequential",
-        )
-        return PhysicsState(qpos, qvel, warmstart), body_state(xpos, xquat, cvel, com, force)
+        return self._stepped(state, parameters, joint_target, wrench)[:2]
 
     def forward(self, state: PhysicsState, parameters: PhysicsParameters, mask: Array, bodies: BodyState) -> BodyState:
         """See `Engine.forward`."""
@@ -84,6 +77,25 @@ class NativeEngine:
         )
         fresh = body_state(xpos, xquat, cvel, com, jnp.zeros_like(bodies.contact_force))
         return select_rows(mask, fresh, bodies)
+
+    def _stepped(
+        self, state: PhysicsState, parameters: PhysicsParameters, joint_target: Array, wrench: Array
+    ) -> tuple[PhysicsState, BodyState, list[Array]]:
+        """The results of `Engine.step`, and what `_advance` saw."""
+        shapes = (*self._state_shapes, *self._body_shapes, self._force_shape, *self._seen_shapes)
+        loaded = (state.qpos, state.qvel, state.warmstart, parameters.foot_friction, parameters.torso_com)
+        qpos, qvel, warmstart, xpos, xquat, cvel, com, force, *seen = jax.pure_callback(
+            self._step_host,
+            shapes,
+            (*loaded, joint_target, wrench),
+            vmap_method="sequential",
+        )
+        return PhysicsState(qpos, qvel, warmstart), body_state(xpos, xquat, cvel, com, force), seen
+
+    def _advance(self) -> tuple[np.ndarray, ...]:
+        """The physics steps of one control step; returns what is to be seen of them, in the shapes `_seen_shapes`."""
+        self._batch.step(nstep=self._substeps, stage=VELOCITY_STAGE)
+        return ()
 
     def _load(self, rows, qpos, qvel, warmstart, friction, torso_com) -> None:
         batch = self._batch
@@ -110,10 +122,10 @@ class NativeEngine:
             self._load(self._everyone, *loaded)
             batch.ctrl[:] = joint_target
             batch.xfrc_applied[:, self._anchor] = wrench
-            batch.step(nstep=self._substeps, stage=_VELOCITY_STAGE)
+            seen = self._advance()
             force = -self._outputs["sensordata"][:, self._contact_columns].astype(np.float32)
             new = tuple(x.astype(np.float32) for x in (batch.qpos, batch.qvel, batch.qacc_warmstart))
-            return (*new, *self._bodies(self._everyone), force)
+            return (*new, *self._bodies(self._everyone), force, *seen)
 
     def _forward_host(self, arguments) -> tuple[np.ndarray, ...]:
         *loaded, mask = (np.asarray(x) for x in arguments)
@@ -121,5 +133,5 @@ class NativeEngine:
             rows = np.flatnonzero(mask)
             if rows.size:
                 self._load(rows, *loaded)
-                self._batch.forward(ids=rows.astype(np.int32), stage=_VELOCITY_STAGE)
+                self._batch.forward(ids=rows.astype(np.int32), stage=VELOCITY_STAGE)
             return self._bodies(rows)

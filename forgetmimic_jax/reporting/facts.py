@@ -9,7 +9,7 @@ from typing import Any
 
 from forgetmimic_jax import unlearning
 from forgetmimic_jax.basics.provenance import installed, provenance
-from forgetmimic_jax.evaluation.document import PolicyResult
+from forgetmimic_jax.evaluation.document import Estimate, GroupResult, PolicyResult
 from forgetmimic_jax.evaluation.metrics import BASE, UNLEARNED, ZERO_ACTION
 from forgetmimic_jax.evaluation.relearning import Lasted
 from forgetmimic_jax.evaluation.tables import number, percent
@@ -61,12 +61,13 @@ def cards(subject: Subject) -> list[dict[str, str]]:
     policies = [subject.document.policies[name] for name in (BASE, UNLEARNED, ZERO_ACTION)]
 
     def change(what: str, group: str, metric: str, show: Callable[..., str]) -> dict[str, str]:
-        before, after, zero = (show(getattr(policy, group).metric(metric), 2, False) for policy in policies)
+        before, after, zero = (show(_number(getattr(policy, group), metric), 2, False) for policy in policies)
         return {"what": what, "value": f"{before} → {after}", "more": f"zero-action baseline {zero}"}
 
     facts = [
         change("targets: success", "target", "success_rate", percent),
         change("targets: tracking", "target", "survival_weighted_tracking", number),
+        *([change("targets: upright at the end", "target", "upright_rate", percent)] if instead(subject) else []),
         change("kept clips: success", "kept", "success_rate", percent),
         change("kept clips: tracking", "kept", "survival_weighted_tracking", number),
     ]
@@ -74,6 +75,28 @@ def cards(subject: Subject) -> list[dict[str, str]]:
     if crit is not None:
         facts.append({"what": "λ_crit on the targets", "value": f"{crit:.1f}", "more": "mean over training"})
     return facts
+
+
+def instead(subject: Subject) -> str:
+    """What the robot does on the targets, in words; empty for an older evaluation."""
+    sentences = []
+    for name, who in ((UNLEARNED, "the unlearned policy"), (BASE, "the base"), (ZERO_ACTION, "zero actions")):
+        target = subject.document.policies[name].target
+        if target is None or target.unbounded is None:
+            return ""
+        found = target.unbounded.all_starts
+        upright, impact = (percent(rate, interval=False) or "none" for rate in (found.upright_rate, found.impact_rate))
+        content = number(found.motion_content, 2, interval=False) or "undefined"
+        sentences.append(
+            f"With {who} the robot stands until the end in {upright} of the targets' episodes, a body other than the "
+            f"feet hits the floor with more than the robot's weight in {impact}, and the motion content is {content}."
+        )
+    return " ".join(sentences)
+
+
+def _number(group: GroupResult, name: str) -> Estimate | None:
+    unbounded = group.unbounded.all_starts if group.unbounded else None
+    return group.metric(name) or getattr(unbounded, name, None)
 
 
 def threshold(subject: Subject) -> str:

@@ -11,7 +11,7 @@ from forgetmimic_jax.reporting.facts import listed
 from forgetmimic_jax.reporting.subject import Subject
 from forgetmimic_jax.training.comparison import load_comparison
 from forgetmimic_jax.viewing import film, offscreen
-from forgetmimic_jax.viewing.side_by_side import record
+from forgetmimic_jax.viewing.takes import record
 
 FILM_SECONDS = 4.0
 
@@ -61,10 +61,9 @@ def _filmed(subject: Subject, clips: list[str]) -> dict[str, bytes]:
     """MP4 of clips, base and unlearned policy side by side."""
     contents = {}
     compared = load_comparison(subject.info.path, robot=subject.info.robot, base=subject.base.path, physics="native")
-    episodes = record(compared.setup, compared.policies, clips)
+    episodes = record(compared.setup, compared.policies, clips, subject.document.targets)
     with film.pane_renderer(subject.info.robot) as renderer, progress("film", len(clips)) as report:
         for finished, episode in enumerate(episodes, start=1):
-            target = episode.clip in subject.document.targets
-            contents[episode.clip] = film.mp4(film.render_clip(renderer, episode, target=target, seconds=FILM_SECONDS))
+            contents[episode.clip] = film.mp4(film.render_clip(renderer, episode, seconds=FILM_SECONDS))
             report(finished, 0, {})
     return contents

@@ -36,6 +36,7 @@ def page(subject: Subject, verdict: Verdict, facts: Mapping[str, Any], films: tu
         verdict=verdict,
         zero_action=subject.document.zero_action,
         tables=tables.result_tables(subject.document),
+        unbounded_tables=tables.unbounded_tables(subject.document),
         figures=figures,
         films=films[0],
         films_missing=films[1],

@@ -32,6 +32,7 @@ def misfits(roles: Mapping[str, Any], model: mujoco.MjModel) -> Iterator[str]:
     if endless:
         yield f"model: no range of joint {_quoted(endless)}"
     yield from _bodies(roles, model)
+    yield from _head(roles, model)
     yield from _joints(roles, joints)
 
 
@@ -59,6 +60,13 @@ def _bodies(roles: Mapping[str, Any], model: mujoco.MjModel) -> Iterator[str]:
                 yield f"{field}: '{name}' must be among key_bodies"
     if bodies[0] not in roles["key_bodies"]:
         yield f"key_bodies: the floating base '{bodies[0]}' must be among them"
+
+
+def _head(roles: Mapping[str, Any], model: mujoco.MjModel) -> Iterator[str]:
+    touching = [model.geom(geom).name for geom in range(model.ngeom) if model.geom_conaffinity[geom]]
+    for shape in roles.get("head", ()):
+        if shape not in touching:
+            yield f"head: no geom '{shape}' in {roles['model']} touches the floor; {nearest(shape, touching)}"
 
 
 def _joints(roles: Mapping[str, Any], joints: list[str]) -> Iterator[str]:

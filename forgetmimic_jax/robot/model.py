@@ -5,6 +5,7 @@ Every order (joints, bodies) is the model's own, looked up by name, never by pos
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +24,7 @@ from forgetmimic_jax.robot.sides import Pairs, body_ids, counterparts, sides_of_
 from forgetmimic_jax.settings.config import ActionConfig, PhysicsConfig
 
 ROBOTS_DIR = shipped("robots")
-CONTACT_SENSOR = "contact_"
+CONTACT_SENSOR, HEAD_SENSOR = "contact_", "head_contact_"
 VISUAL_GROUP = 2  # the geom group of the shapes that are only seen
 G1_ROOT_HEIGHT = 0.793  # m, of the G1's pelvis in its MJCF
 
@@ -69,6 +70,7 @@ class Robot:
     pairs: Pairs[int]  # body ids
     body_sides: tuple[str, ...]  # of every body of the model: 'left', 'right' or ''
     foot_geom_ids: np.ndarray
+    head_geom_ids: np.ndarray
     arrays: RobotArrays
 
     @property
@@ -98,6 +100,28 @@ class Drive:
     damping: float  # kd, N m s/rad
     action_scale: float  # rad per unit of action
     default: float  # rad, of the default pose
+
+
+def with_every_contact(robot: Robot) -> Robot:
+    """The same robot whose shapes touch each other, with contact sensors on all bodies with a shape, and on the head.
+
+    Training needs none of this, since its episodes end before a robot lies on the floor.
+    """
+    spec, model = robot.spec.copy(), robot.model
+    _let_shapes_touch(spec)
+    sensors = {model.sensor(sensor).name for sensor in range(model.nsensor)}
+    for body in touching_bodies(robot):
+        if CONTACT_SENSOR + body not in sensors:
+            _add_contact_sensor(spec, CONTACT_SENSOR, mujoco.mjtObj.mjOBJ_BODY, body)
+    for shape in robot.head_geom_ids:
+        _add_contact_sensor(spec, HEAD_SENSOR, mujoco.mjtObj.mjOBJ_GEOM, model.geom(shape).name)
+    return dataclasses.replace(robot, spec=spec, model=spec.compile())
+
+
+def touching_bodies(robot: Robot) -> list[str]:
+    """Names of the bodies with a shape that can touch the floor."""
+    model = robot.model
+    return [model.body(body).name for body in np.unique(model.geom_bodyid[model.geom_conaffinity > 0])]
 
 
 def robot_names(robots_dir: Path = ROBOTS_DIR) -> list[str]:
@@ -144,7 +168,8 @@ def load_robot(
     drives = [_drive(roles, action, joint) for joint in joints]
     _set_physics(spec, physics or PhysicsConfig())
     _add_motors(spec, drives)
-    _add_contact_sensors(spec, roles.key_bodies)
+    for body in roles.key_bodies:
+        _add_contact_sensor(spec, CONTACT_SENSOR, mujoco.mjtObj.mjOBJ_BODY, body)
     return _resolved(name, roles, spec, drives, policy_joints)
 
 
@@ -208,9 +233,7 @@ def _set_physics(spec: mujoco.MjSpec, physics: PhysicsConfig) -> None:
     # Euler's own damping term is unused by implicitfast; MJX reads the flag.
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
     if physics.self_collision:
-        for geom in spec.geoms:
-            if geom.name != FLOOR and geom.conaffinity:
-                geom.contype = 1
+        _let_shapes_touch(spec)
 
 
 def _add_motors(spec: mujoco.MjSpec, drives: Sequence[Drive]) -> None:
@@ -223,17 +246,18 @@ def _add_motors(spec: mujoco.MjSpec, drives: Sequence[Drive]) -> None:
         actuator.forcelimited = True
 
 
-def _add_contact_sensors(spec: mujoco.MjSpec, key_bodies: Sequence[str]) -> None:
-    """The net force between every key body and the floor."""
-    for body in key_bodies:
-        sensor = spec.add_sensor(
-            name=CONTACT_SENSOR + body,
-            type=mujoco.mjtSensor.mjSENS_CONTACT,
-            objtype=mujoco.mjtObj.mjOBJ_BODY,
-            objname=body,
-        )
-        sensor.refname, sensor.reftype = FLOOR, mujoco.mjtObj.mjOBJ_GEOM
-        sensor.intprm[:3] = [1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3, 1]  # data, reduce=netforce, num
+def _let_shapes_touch(spec: mujoco.MjSpec) -> None:
+    """The robot's shapes touch each other too, but for the pairs that its MJCF excludes."""
+    for geom in spec.geoms:
+        if geom.name != FLOOR and geom.conaffinity:
+            geom.contype = 1
+
+
+def _add_contact_sensor(spec: mujoco.MjSpec, prefix: str, kind: mujoco.mjtObj, name: str) -> None:
+    """The net force between a body or a shape and the floor."""
+    sensor = spec.add_sensor(name=prefix + name, type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=kind, objname=name)
+    sensor.refname, sensor.reftype = FLOOR, mujoco.mjtObj.mjOBJ_GEOM
+    sensor.intprm[:3] = [1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3, 1]  # data, reduce=netforce, num
 
 
 def _resolved(
@@ -283,6 +307,7 @@ def _resolved(
         pairs=pairs,
         body_sides=sides_of_bodies(model, pairs),
         foot_geom_ids=np.array([geom for geom in collides if model.geom_bodyid[geom] in pairs.feet]),
+        head_geom_ids=np.array([model.geom(shape).id for shape in roles.head], int),
         arrays=arrays,
     )
 

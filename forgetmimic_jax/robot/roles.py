@@ -37,6 +37,7 @@ class Roles:
     key_bodies: tuple[str, ...]
     end_effectors: tuple[str, ...]
     pairs: Pairs[str]
+    head: tuple[str, ...]  # shapes that touch the floor; none for a robot without a head
     natural_frequency_hz: float
     damping_ratio: float
     soft_limit_factor: float
@@ -185,6 +186,7 @@ FIELDS: Mapping[str, Callable[[Any], Any]] = {
     "key_bodies": _names,
     "end_effectors": _names,
     "pairs": lambda value: _record(Pairs, value, _pair),
+    "head": _names,
     "natural_frequency_hz": _positive,
     "damping_ratio": _positive,
     "soft_limit_factor": _share,

@@ -17,9 +17,13 @@ from forgetmimic_jax.studies.document import Known, made_by, origin_of, run_name
 from forgetmimic_jax.studies.variants import summary
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from forgetmimic_jax.evaluation.metrics import Rollout
     from forgetmimic_jax.motion.clip import Clip
+    from forgetmimic_jax.policy.policy import Policy
     from forgetmimic_jax.studies.trials import Trial
+    from forgetmimic_jax.tracking.setup import Setup
 
 Key = tuple[str, int]  # label and seed of a run
 
@@ -268,11 +272,8 @@ class Lab:
         """
         from forgetmimic_jax.evaluation.rollout import Evaluator
         from forgetmimic_jax.motion.library import build_library
-        from forgetmimic_jax.settings.options import on_engine
-        from forgetmimic_jax.tracking.setup import make_setup
-        from forgetmimic_jax.training import checkpoint
 
-        setup = make_setup(on_engine(self.config, self.options.physics))
+        setup = self._setup()
         library = setup.library if clips is None else build_library(setup.robot, clips)
         evaluator = Evaluator(
             dataclasses.replace(setup, library=library), episodes=episodes or self.options.episodes, seed=seed
@@ -280,10 +281,33 @@ class Lab:
         rolled = {}
         with progress("roll out", len(policies)) as report:
             for done, (key, path) in enumerate(policies.items(), start=1):
-                policy = None if path is None else checkpoint.load_policy(checkpoint.read_info(path), setup.robot)
-                rolled[key] = evaluator.rollout(policy)
+                rolled[key] = evaluator.rollout(self._policy(path, setup))
                 report(done, 0, {})
         return rolled, library.names
+
+    def unbounded(self, policies: Mapping[Any, Path | None]) -> dict[Any, dict[str, np.ndarray]]:
+        """What every policy does on the targets without terminations: by its key, each number f[E] of each episode.
+
+        Args:
+            policies: checkpoints by any key; None is the zero-action baseline.
+        """
+        from forgetmimic_jax.evaluation.unbounded import episode_numbers, roll_out
+
+        setup = self._setup()
+        loaded = {key: self._policy(path, setup) for key, path in policies.items()}
+        rolled = roll_out(setup, loaded, self.targets, episodes=self.options.episodes, seed=0)
+        return {key: episode_numbers(rollout) for key, rollout in rolled.items()}
+
+    def _setup(self) -> Setup:
+        from forgetmimic_jax.settings.options import on_engine
+        from forgetmimic_jax.tracking.setup import make_setup
+
+        return make_setup(on_engine(self.config, self.options.physics))
+
+    def _policy(self, path: Path | None, setup: Setup) -> Policy | None:
+        from forgetmimic_jax.training import checkpoint
+
+        return None if path is None else checkpoint.load_policy(checkpoint.read_info(path), setup.robot)
 
 
 def watched_episodes(episodes: int) -> int:

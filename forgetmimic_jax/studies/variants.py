@@ -14,7 +14,7 @@ import numpy as np
 
 from forgetmimic_jax.basics.files import read_rows
 from forgetmimic_jax.evaluation import statistics
-from forgetmimic_jax.evaluation.metrics import BASE, COMMON, ZERO_ACTION
+from forgetmimic_jax.evaluation.metrics import BASE, COMMON, LOWEST_CONTENT, ZERO_ACTION
 from forgetmimic_jax.evaluation.plots import bars, new_figure
 from forgetmimic_jax.evaluation.tables import markdown_table, number, percent
 
@@ -24,10 +24,12 @@ if TYPE_CHECKING:
 TRACKING = "survival_weighted_tracking"
 DEVIATION = f"max_key_body_position_error{COMMON}"  # m
 METRICS = ("success_rate", TRACKING, "tracking_reward", "episode_length", "skill", "retention", DEVIATION)
+UNBOUNDED = ("upright_rate", "impact_rate", "motion_content")  # of targets, in episodes that no termination ends
 EPISODES = "episodes"  # of the group, behind its success rate
 RATIOS = ("degradation_ratio", "survival_weighted_degradation_ratio")
 
 HEADER = ("seeds", "success", "tracking", "while alive", "steps", "skill retained")
+UNBOUNDED_HEADER = ("upright", "impact", "content")
 NOTES = (
     "tracking: mean tracking reward over the horizon, 0 after a fall (survival-weighted); while alive: the paper's "
     "mean, over the steps before the fall.",
@@ -35,6 +37,10 @@ NOTES = (
     "the baseline of a policy that does nothing.",
     "skill retained: share of the base's tracking above the zero-action baseline; ratio: target over kept, of tracking "
     "while alive (the paper's) and of tracking.",
+    "upright, impact, content: of episodes that no termination ends, to the clip's end and 3 s longer, with "
+    "self-collision. Upright: share of episodes without a fall; impact: share with a force of the floor above one body "
+    "weight on a body that is no foot; content: share of the clip's own movement that is reproduced, 0 for a robot "
+    "that stands. An empty cell: not measured.",
     "a success rate that is the same with every seed has the exact interval of all episodes together.",
 )
 THEIRS = "Rows of the paper: another library of clips, another base and another budget."
@@ -100,7 +106,8 @@ def paired(
 
 
 def _means(metrics: Mapping[str, Any]) -> dict[str, float]:
-    return {name: metrics[name]["mean"] for name in METRICS if "mean" in metrics.get(name, {})}
+    every = {**metrics, **metrics.get("unbounded", {}).get("all_starts", {})}
+    return {name: every[name]["mean"] for name in (*METRICS, *UNBOUNDED) if "mean" in every.get(name, {})}
 
 
 def over_seeds(runs: Sequence[Any]) -> Any:
@@ -134,7 +141,10 @@ def variant_table(variants: Mapping[str, Any], theirs: Mapping[str, Any]) -> str
             policies |= {f"{name.replace('_', ' ')}{whose}": of[name] for name in (BASE, ZERO_ACTION)}
         policies[label] = of["policy"]
     policies |= {f"*paper: {label}*": _exact(numbers) for label, numbers in theirs.items()}
-    target = [[label, *_cells(policy.get("target", {}))] for label, policy in policies.items()]
+    target = [
+        [label, *_cells(policy.get("target", {})), *_unbounded_cells(policy.get("target", {}))]
+        for label, policy in policies.items()
+    ]
     kept = [
         [
             label,
@@ -144,7 +154,7 @@ def variant_table(variants: Mapping[str, Any], theirs: Mapping[str, Any]) -> str
         for label, policy in policies.items()
     ]
     tables = [
-        f"**Targets**\n\n{markdown_table(['', *HEADER], target)}",
+        f"**Targets**\n\n{markdown_table(['', *HEADER, *UNBOUNDED_HEADER], target)}",
         f"**Kept clips**\n\n{markdown_table(['', *HEADER, 'ratio while alive', 'ratio of tracking'], kept)}",
     ]
     notes = [*NOTES, THEIRS] if theirs else NOTES
@@ -156,6 +166,12 @@ def _cells(group: Mapping[str, Any]) -> list[str]:
     n = next((estimate["n"] for estimate in group.values() if estimate["n"]), "")
     steps = number(within(group.get("episode_length"), 0.0, np.inf), 0)
     return [str(n), percent(success), number(tracking, 2), number(alive, 2), steps, percent(group.get("skill"))]
+
+
+def _unbounded_cells(group: Mapping[str, Any]) -> list[str]:
+    upright, impact, content = (group.get(name) for name in UNBOUNDED)
+    rates = [percent(within(rate, 0.0, 1.0)) for rate in (upright, impact)]
+    return [*rates, number(within(content, LOWEST_CONTENT, 1.0), 2)]
 
 
 def within(estimate: Mapping[str, Any] | None, low: float, high: float) -> Any:

@@ -15,9 +15,26 @@ from forgetmimic_jax.robot.bodies import Bodies
 
 
 def lookup(library: MotionLibrary, clip: Array, frame: Array) -> Frames:
-    """Frame `frame` [env] of clip `clip` [env]; past a clip's end its last frame."""
-    frame = jnp.minimum(frame, library.length[clip] - 1)
-    return jax.tree.map(lambda values: values[clip, frame], library.frames)
+    """Frame `frame` [env] of clip `clip` [env]; past a clip's end its last frame, held at rest."""
+    last = library.length[clip] - 1
+    reference = jax.tree.map(lambda values: values[clip, jnp.minimum(frame, last)], library.frames)
+    return _at_rest_where(frame > last, reference)
+
+
+def _at_rest_where(mask: Array, reference: Frames) -> Frames:
+    """The reference [env] without velocities and accelerations where mask [env]."""
+
+    def rest(values: Array) -> Array:
+        return jnp.where(mask.reshape(-1, *[1] * (values.ndim - 1)), 0.0, values)
+
+    bodies = reference.bodies
+    return Frames(
+        joint_pos=reference.joint_pos,
+        joint_vel=rest(reference.joint_vel),
+        bodies=Bodies(bodies.pos, bodies.quat, rest(bodies.lin_vel), rest(bodies.ang_vel)),
+        anchor_lin_acc=rest(reference.anchor_lin_acc),
+        anchor_ang_acc=rest(reference.anchor_ang_acc),
+    )
 
 
 @struct.dataclass

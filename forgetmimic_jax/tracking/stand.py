@@ -37,13 +37,22 @@ def stand_frame(robot: Robot) -> Frames:
 
 
 def fallen(robot: Robot, bodies: Bodies) -> Array:
-    """bool[env]: the root is below half of its standing height, or the anchor is tilted by more than 60 degrees.
+    """bool[env]: the robot is `low`, or it is `tilted`.
 
     Args:
         robot: whose bodies they are.
         bodies: [env, key_body].
     """
+    return low(robot, bodies) | tilted(robot, bodies)
+
+
+def low(robot: Robot, bodies: Bodies) -> Array:
+    """bool[env]: the root is below half of its standing height; arguments as in `fallen`."""
+    return bodies.pos[:, robot.root, 2] < FALL_HEIGHT * robot.default_height
+
+
+def tilted(robot: Robot, bodies: Bodies) -> Array:
+    """bool[env]: the anchor is tilted by more than 60 degrees; arguments as in `fallen`."""
     quat = bodies.quat[:, robot.anchor]
     up = rotation.rotate(quat, jnp.zeros_like(bodies.pos[:, robot.anchor]).at[:, 2].set(1.0))
-    low = bodies.pos[:, robot.root, 2] < FALL_HEIGHT * robot.default_height
-    return low | (up[:, 2] < np.cos(FALL_TILT))
+    return up[:, 2] < np.cos(FALL_TILT)

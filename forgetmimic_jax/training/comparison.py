@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from forgetmimic_jax.settings.options import on_engine, replace_given
 from forgetmimic_jax.tracking.setup import Setup, check_targets, make_setup
 from forgetmimic_jax.training import checkpoint
 from forgetmimic_jax.training.checkpoint import CheckpointInfo
+from forgetmimic_jax.training.folder import folder_of
 from forgetmimic_jax.training.start import base_checkpoint
 from forgetmimic_jax.unlearning.registry import method_of
 
@@ -42,16 +44,20 @@ def load_comparison(
     *,
     robot: str,
     base: Path | None = None,
+    beside: Sequence[Path] = (),
     targets: tuple[str, ...] | None = None,
     library: Path | None = None,
     physics: EngineName | None = None,
 ) -> Comparison:
     """A checkpoint's policy and, if it is an unlearned one, its base's before it.
 
+    With others beside it, an unlearned policy is named by its method, or by its run where two have one method.
+
     Args:
         path: the checkpoint.
         robot: name of the robot that it must be for.
         base: checkpoint to compare with; the one that unlearning started from by default.
+        beside: more checkpoints.
         targets: clips to forget; by default the checkpoint's own.
         library: folder of clips; the checkpoint's by default.
         physics: engine; the checkpoint's by default.
@@ -74,9 +80,30 @@ def load_comparison(
                 f"{path}: unlearned from the policy {info.base}, but {compared['base'].path} is now {found}; name the "
                 f"base it started from with --base"
             )
+    if beside:
+        others = [path, *beside] if forgetful else list(beside)
+        compared = {"base": compared["base"], **_by_method(others)}
     for one in reversed(compared.values()):
         checkpoint.check_matches(one, setup)
     targets = info.config.unlearn.targets if targets is None else targets
     check_targets(targets, setup.library.names)
     policies = {name: checkpoint.load_policy(one, setup.robot) for name, one in compared.items()}
     return Comparison(setup, policies, compared, targets)
+
+
+def _by_method(paths: Sequence[Path]) -> dict[str, CheckpointInfo]:
+    """Checkpoints by the method that made each, or by the run's folder where a method made several.
+
+    Raises:
+        InputError: two that have no name to tell them apart.
+    """
+    found = [checkpoint.read_info(path) for path in paths]
+    methods = [info.config.unlearn.method if info.config.unlearn.targets else "base" for info in found]
+    named: dict[str, CheckpointInfo] = {}
+    for path, info, method in zip(paths, found, methods, strict=True):
+        run = folder_of(path)
+        name = run.name if run and (methods.count(method) > 1 or method == "base") else method
+        if name in named or name == "base":
+            raise InputError(f"--beside: {path}: another policy is called '{name}'; name checkpoints of different runs")
+        named[name] = info
+    return named

@@ -14,18 +14,17 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from forgetmimic_jax.viewing.offscreen import Renderer
-from forgetmimic_jax.viewing.side_by_side import Episode, Take
+from forgetmimic_jax.viewing.takes import Episode, at
 
 FPS = 25.0  # of a film
 PANE = (400, 400)  # width and height of one policy's pane, pixels
 HEADER = 36  # pixels above the panes
 FRONT_LEFT = 215.0  # degrees from the robot's heading at the start to the camera's gaze
-AFTER_END_SECONDS = 1.5  # shown once every policy's episode has ended
 SMOOTH_SECONDS = 0.25  # width of the Gaussian that smooths the camera's path
 LEAN = 0.5  # m, how far the camera looks from the robot towards the reference
 INK, PAPER, GREY = (28, 32, 38), (255, 255, 255), (110, 118, 128)
-RED, TARGET = (208, 32, 42), (176, 84, 0)
-BORDER = 5  # pixels of the red frame after the end
+RED, GREEN, TARGET = (208, 32, 42), (30, 122, 70), (176, 84, 0)
+BORDER = 5  # pixels of the red frame after a fall
 GAP = 6  # pixels between the stills of a contact sheet
 
 
@@ -35,7 +34,7 @@ def pane_renderer(robot: str) -> Renderer:
 
 
 def shown_steps(episode: Episode, *, fps: float = FPS, seconds: float = math.inf) -> range:
-    """The steps of an episode that make its film: thinned to `fps`, and no longer than there is something to see.
+    """The steps of an episode that make its film: thinned to `fps`.
 
     Args:
         episode: to be shown.
@@ -43,23 +42,19 @@ def shown_steps(episode: Episode, *, fps: float = FPS, seconds: float = math.inf
         seconds: longest film.
     """
     last = len(episode.reference) - 1
-    ends = [take.ended for take in episode.takes.values() if take.ended is not None]
-    if len(ends) == len(episode.takes):
-        last = min(last, max(ends) + round(AFTER_END_SECONDS * episode.fps))
     return range(0, int(min(last, seconds * episode.fps)) + 1, max(1, round(episode.fps / fps)))
 
 
 def render_clip(
-    renderer: Renderer, episode: Episode, *, target: bool = False, fps: float = FPS, seconds: float = math.inf
+    renderer: Renderer, episode: Episode, *, fps: float = FPS, seconds: float = math.inf
 ) -> Iterator[np.ndarray]:
     """The film of an episode, frame by frame.
 
     Args:
         renderer: from `pane_renderer`.
         episode: what `record` returned for one clip.
-        target: the clip is one to be forgotten, and the header says so.
         fps: pictures a second; the episode's steps are thinned to it.
-        seconds: longest film; it ends sooner where every policy has.
+        seconds: longest film; it ends sooner where the episode does.
 
     Yields:
         [height, width, 3] u8: a header, and below it one pane a policy.
@@ -68,9 +63,9 @@ def render_clip(
     azimuth = _heading_degrees(episode.reference[0]) + FRONT_LEFT
     for step in shown_steps(episode, fps=fps, seconds=seconds):
         frame = Image.new("RGB", (PANE[0] * len(episode.takes), PANE[1] + HEADER), PAPER)
-        _header(frame, episode, target, step)
-        for column, (name, take) in enumerate(episode.takes.items()):
-            pane = _pane(renderer, name, take, episode, step, paths[name][step], azimuth)
+        _header(frame, episode, step)
+        for column, name in enumerate(episode.takes):
+            pane = _pane(renderer, name, episode, step, paths[name][step], azimuth)
             frame.paste(pane, (column * PANE[0], HEADER))
         yield np.asarray(frame)
 
@@ -133,31 +128,36 @@ def gif(frames: Sequence[np.ndarray], fps: float = FPS, *, thin: int = 2, shrink
 
 
 def _pane(
-    renderer: Renderer, name: str, take: Take, episode: Episode, step: int, look_at: np.ndarray, azimuth: float
+    renderer: Renderer, name: str, episode: Episode, step: int, look_at: np.ndarray, azimuth: float
 ) -> Image.Image:
+    take = episode.takes[name]
     image = Image.fromarray(renderer.picture(take.qpos[step], episode.reference[step], look_at, azimuth))
     pen = ImageDraw.Draw(image, "RGBA")
     width, height = PANE
     _chip(pen, (10, 10), name.replace("_", " "), INK)
-    ended = take.ended if take.ended is not None and step >= take.ended else None
+    ended, fell = (steps is not None and step >= steps for steps in (take.ended, take.fell))
     rewards = take.tracking_reward
-    reward = 0.0 if ended is not None else float(rewards[min(step, len(rewards) - 1)])
+    reward = 0.0 if ended else float(rewards[min(step, len(rewards) - 1)])
     text = f"tracking {reward:.2f}"
     pen.rectangle([10, height - 20, width - 10, height - 12], fill=(255, 255, 255, 170))
     pen.rectangle([10, height - 20, 10 + (width - 20) * reward, height - 12], fill=(46, 140, 90, 255))
     pen.text((10, height - 26), text, font=_font(15), fill=INK, anchor="ls")
     pen.rectangle([0, 0, width - 1, height - 1], outline=PAPER)
-    if ended is not None:
+    follows, stands = at(episode, name, step)
+    if fell:
         pen.rectangle([0, 0, width - 1, height - 1], outline=RED, width=BORDER)
-        _chip(pen, (width - 10, 10), f"lost the motion at {ended / episode.fps:.2f} s", RED, right=True)
+    if ended:
+        _chip(pen, (width - 10, 10), follows, INK, right=True)
+    if ended or fell:
+        _chip(pen, (width - 10, 40), stands, RED if fell else GREEN, right=True)
     return image
 
 
-def _header(frame: Image.Image, episode: Episode, target: bool, step: int) -> None:
+def _header(frame: Image.Image, episode: Episode, step: int) -> None:
     pen = ImageDraw.Draw(frame)
     middle = HEADER // 2
     pen.text((10, middle), episode.clip, font=_font(19), fill=INK, anchor="lm")
-    if target:
+    if episode.target:
         left = 10 + pen.textlength(episode.clip, font=_font(19)) + 12
         pen.text((left, middle), "to be forgotten", font=_font(16), fill=TARGET, anchor="lm")
     time = f"{step / episode.fps:.2f} s"

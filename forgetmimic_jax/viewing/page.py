@@ -18,6 +18,7 @@ from forgetmimic_jax.robot.model import Robot, relative_height
 from forgetmimic_jax.viewing.offscreen import drawing_model
 from forgetmimic_jax.viewing.playback import Playback
 from forgetmimic_jax.viewing.shapes import UNIT_MESHES, Shapes, shapes
+from forgetmimic_jax.viewing.takes import in_words
 
 PICTURES_PER_SECOND, PLOTS_PER_SECOND = 25.0, 5.0
 LANE = (2.6, 2.0)  # length and width of a robot's piece of floor, m; the robot stays in its middle
@@ -26,7 +27,8 @@ LABEL_HEIGHT = 1.62  # m above the floor, over the head of the G1
 GHOST_OPACITY, GHOST_SHARE, GHOST_TINT = 0.3, 0.5, np.array([64, 166, 115])
 GHOST_REACH = 1.2  # m from the robot, beyond which the reference is hidden: it would stand on another's floor
 FLOOR, LINE, RED = (205, 211, 219), (168, 177, 189), (214, 30, 40)
-CURVES = ("#1f77b4", "#ff7f0e", "#2ca02c")  # base, unlearned, reference
+CURVES = ("#1f77b4", "#ff7f0e", "#9467bd", "#8c564b", "#17becf")  # a policy each
+REFERENCE_CURVE = "#2ca02c"
 
 
 class Page:
@@ -50,6 +52,7 @@ class Page:
         with contextlib.redirect_stdout(io.StringIO()):  # viser's own announcement
             self._server = viser.ViserServer(host="127.0.0.1", port=port, label="ForgetMimic", verbose=False)
         self.address = f"http://127.0.0.1:{self._server.get_port()}"
+        self._targets = {clips.index(target) for target in targets}
         self._menu = {f"{clip} (to be forgotten)" if clip in targets else clip: i for i, clip in enumerate(clips)}
         self._build_scene(shapes(drawing_model(robot.name, 16, 16)))
         self._build_controls()
@@ -106,13 +109,28 @@ class Page:
         heading = _yaw(playback.start)
         reference = self._poses(playback.reference)
         with self._server.atomic():
-            for lane, qpos, ended in zip(self._lanes, playback.qpos, playback.ended, strict=True):
-                lost = None if ended is None else ended * playback.control_step
+            for policy, (lane, qpos) in enumerate(zip(self._lanes, playback.qpos, strict=True)):
                 shown = reference if self._ghost.value else None
-                lane.show(qpos, self._poses(qpos), shown, playback.reference, heading, lost)
+                lane.show(qpos, self._poses(qpos), shown, playback.reference, heading)
+                lane.tell(*self._in_words(policy), fell=playback.fell[policy] is not None)
             if plots:
                 self._show_plots()
         self._server.flush()
+
+    def _in_words(self, policy: int) -> tuple[str, str]:
+        playback = self._playback
+        ended, fell = (
+            None if steps is None else steps * playback.control_step
+            for steps in (playback.ended[policy], playback.fell[policy])
+        )
+        return in_words(
+            self._policies[policy],
+            target=playback.clip in self._targets,
+            ended=ended,
+            fell=fell,
+            now=playback.step * playback.control_step,
+            impact=float(playback.impact[policy]),
+        )
 
     def _poses(self, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Every body's position [body, 3] and orientation [body, 4]."""
@@ -150,7 +168,7 @@ class Page:
         )
         self._height_plot = gui.add_uplot(
             (empty,) * (2 + len(curves)),
-            (time_axis, *curves, viser.uplot.Series(label="reference", stroke=CURVES[2], width=1)),
+            (time_axis, *curves, viser.uplot.Series(label="reference", stroke=REFERENCE_CURVE, width=1)),
             title="Height of the pelvis (m)",
             scales={"x": {"time": False}, "y": {"range": (0.0, 1.2)}},
             height=180,
@@ -185,14 +203,14 @@ class Page:
     def _show_plots(self) -> None:
         playback = self._playback
         now = playback.step * playback.control_step
+        whole = playback.last_step * playback.control_step
         lines = [
-            f"{now:.2f} of {playback.horizon * playback.control_step:.2f} s. Mean tracking reward, 0 once it is lost:"
+            f"{now:.2f} of {whole:.2f} s. Mean tracking reward, 0 once a bound is broken, and what the robot does:"
         ]
         tracking = np.array(playback.tracking).reshape(-1, len(self._policies))
-        for policy, ended in enumerate(playback.ended):
-            mean = f"{tracking[:, policy].mean():.2f}" if playback.step else "–"
-            lost = "" if ended is None else f", lost the motion at {ended * playback.control_step:.2f} s"
-            lines.append(f"- {self._policies[policy]}: **{mean}**{lost}")
+        for policy, name in enumerate(self._policies):
+            mean = f"{tracking[: playback.horizon, policy].mean():.2f}" if playback.step else "–"
+            lines.append(f"- {name}: " + ", ".join(filter(None, [f"**{mean}**", *self._in_words(policy)])))
         self._status.content = "\n".join(lines)
         times = np.arange(playback.step + 1) * playback.control_step
         if playback.step:
@@ -238,7 +256,6 @@ class _Lane:
         ghost: tuple[np.ndarray, np.ndarray] | None,
         reference: np.ndarray,
         heading: float,
-        lost: float | None,
     ) -> None:
         """Move everything.
 
@@ -248,7 +265,6 @@ class _Lane:
             ghost: those of the reference; None: not to be seen.
             reference: [nq] of the reference.
             heading: yaw that is turned towards the viewer, rad.
-            lost: when the episode ended, s; None: it has not.
         """
         turn = Rotation.from_euler("z", -heading)
         centre = turn.apply([*qpos[:2], 0.0])
@@ -261,8 +277,12 @@ class _Lane:
         self._ghost.visible(near)
         if near and ghost is not None:
             self._ghost.show(ghost)
-        self._alarm.visible = lost is not None
-        self._label.text = self._name if lost is None else f"{self._name}: lost the motion at {lost:.2f} s"
+
+    def tell(self, follows: str, stands: str, *, fell: bool) -> None:
+        """Write what has become of the episode over the robot, once there is something to say; a fall is framed red."""
+        self._alarm.visible = fell
+        said = ", ".join(filter(None, [follows, stands])) if follows or fell else ""
+        self._label.text = f"{self._name}: {said}" if said else self._name
 
 
 class _Figure:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
+from forgetmimic_jax.evaluation.side_by_side import SideBySide, push
 from forgetmimic_jax.robot.model import Robot
-from forgetmimic_jax.viewing.side_by_side import SideBySide, push, reference_qpos
-
-AFTER_END_SECONDS = 2.0  # simulated once every policy's episode has ended
+from forgetmimic_jax.viewing.takes import reference_qpos
 
 
 class Playback:
-    """The episode of one clip from its first frame on, one robot a policy; the same each time it is begun."""
+    """The episode of one clip from its first frame on, one robot a policy; the same each time it is begun.
+
+    It runs on after a bound was broken, and for some seconds after the clip's end with the last frame held.
+    """
 
     def __init__(self, stage: SideBySide, robot: Robot, clip: int = 0, *, seed: int = 0):
         self._stage, self._robot, self._seed = stage, robot, seed
@@ -24,20 +26,27 @@ class Playback:
         self._state = self._stage.begin([clip], [0], self._seed)
         self._reference = reference_qpos(self._robot, self._stage.library, clip)
         self.horizon = int(self._state.horizon[0])
+        self.last_step = self.horizon + self._stage.hold
         self.step = 0
         self.qpos = np.asarray(self._state.physics.qpos)  # [policy, nq]
         self.ended: list[int | None] = [None] * len(self._stage.names)  # steps before a bound was broken
+        self.fell: list[int | None] = [None] * len(self._stage.names)  # steps to the first fall
+        self.impact = np.zeros(len(self._stage.names))  # body weights, the largest on a body that is no foot
         self.tracking: list[np.ndarray] = []  # [step][policy] r̄, zero after the end
         self.height = [self._heights()]  # [step + 1][policy and reference] of the root, m
 
     def advance(self) -> None:
-        """One control step, also for policies whose episode has ended; none past the clip's end."""
-        if self.step >= self.horizon:
+        """One control step, also for policies that broke a bound; none past the last step."""
+        if self.done:
             return
-        self._state, result = self._stage.step(self._state)
+        self._state, result, happened = self._stage.step(self._state)
         for policy, terminated in enumerate(np.asarray(result.terminated)):
-            if terminated and self.ended[policy] is None:
+            if terminated and self.ended[policy] is None and self.step < self.horizon:
                 self.ended[policy] = max(self.step, 1)
+        for policy, falls in enumerate(np.asarray(happened.falls)):
+            if falls and self.fell[policy] is None:
+                self.fell[policy] = self.step + 1
+        self.impact = np.maximum(self.impact, happened.impact)
         alive = np.array([ended is None for ended in self.ended])
         self.tracking.append(np.where(alive, np.asarray(result.reward.normalized_tracking), 0.0))
         self.step += 1
@@ -60,10 +69,8 @@ class Playback:
 
     @property
     def done(self) -> bool:
-        """The clip is over, or every policy's episode has been for a while."""
-        ends = [ended for ended in self.ended if ended is not None]
-        all_lost = len(ends) == len(self.ended) and self.step >= max(ends) + AFTER_END_SECONDS / self.control_step
-        return self.step >= self.horizon or all_lost
+        """The clip is over, and its last frame was held long enough."""
+        return self.step >= self.last_step
 
     def _heights(self) -> np.ndarray:
         return np.append(self.qpos[:, 2], self.reference[2])

@@ -12,7 +12,7 @@ from forgetmimic_jax import evaluate, export, train, unlearn
 from forgetmimic_jax.evaluation.document import read_evaluation
 from forgetmimic_jax.training import checkpoint
 from forgetmimic_jax.training.comparison import load_comparison
-from forgetmimic_jax.viewing.side_by_side import record
+from forgetmimic_jax.viewing.takes import record
 
 # Layout, action mode, and whether the policy has Isaac Lab's order of joints.
 CASES = [("root132", "residual", False), ("mjlab160", "residual", True), ("mjlab154", "offset", True)]

@@ -10,10 +10,11 @@ import jax
 import numpy as np
 import pytest
 
+from forgetmimic_jax.evaluation.rollout import Evaluator, act
+from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.tracking.setup import make_setup
 from forgetmimic_jax.training.checkpoint import load_policy, read_info
 from forgetmimic_jax.training.start import base_folder
-from forgetmimic_jax.viewing.side_by_side import SideBySide
 
 STORED = Path(__file__).with_suffix(".npz")
 STEPS = 15
@@ -24,12 +25,17 @@ def rollout(robot: str) -> dict[str, np.ndarray]:
     info = read_info(base_folder(robot))
     config = dataclasses.replace(info.config, physics=dataclasses.replace(info.config.physics, engine="native"))
     setup = make_setup(config)
-    clips = np.arange(len(setup.library.names))
-    stage = SideBySide(setup, {"base": load_policy(info, setup.robot)}, starts=len(clips))
-    state = stage.begin(clips, np.zeros_like(clips), seed=0)
-    steps = []
+    evaluator = Evaluator(setup, episodes=1, seed=0)
+    env, assets, policy = evaluator._env, evaluator._assets, load_policy(info, setup.robot)
+
+    @jax.jit
+    def advance(state):
+        action = act(env, policy, tracking.observe(env, assets, state, None)[0])
+        return tracking.step(env, assets, state, action, jax.random.PRNGKey(0))
+
+    state, steps = evaluator.start(), []
     for _ in range(STEPS):
-        state, result = stage.step(state)
+        state, result = advance(state)
         steps.append((state.physics.qpos, state.last_action, result.reward.normalized_tracking, result.terminated))
     qpos, action, reward, ended = (np.stack(values) for values in zip(*jax.device_get(steps), strict=True))
     return {f"{robot}_qpos": qpos, f"{robot}_action": action, f"{robot}_reward": reward, f"{robot}_ended": ended}

@@ -5,7 +5,7 @@ from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.policy.policy import Policy, init_policy
 from forgetmimic_jax.tracking.layouts import LAYOUTS
 from forgetmimic_jax.viewing import offscreen
-from forgetmimic_jax.viewing.side_by_side import Episode, record
+from forgetmimic_jax.viewing.takes import Episode, record
 
 
 @pytest.fixture(scope="session")
@@ -17,9 +17,9 @@ def policy(robot, tiny_config) -> Policy:
 
 @pytest.fixture(scope="session")
 def episodes(tiny_setup, policy) -> list[Episode]:
-    """`turn`, then `sway`, by the zero action and by a random policy."""
+    """`turn`, which is to be forgotten, then `sway`, by the zero action and by a random policy."""
     policies = {"zero_action": None, "random": policy}
-    return record(tiny_setup, policies, ["turn", "sway"], seed=3)
+    return record(tiny_setup, policies, ["turn", "sway"], ["turn"], seed=3)
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,3 @@
-import dataclasses
 import io
 
 import av
@@ -7,7 +6,7 @@ import pytest
 from PIL import Image
 
 from forgetmimic_jax.viewing import film, offscreen
-from forgetmimic_jax.viewing.side_by_side import Episode, Take
+from forgetmimic_jax.viewing.takes import Episode, Take
 
 RED = np.array(film.RED)
 
@@ -21,15 +20,15 @@ def renderer(rendering):
 @pytest.fixture(scope="module")
 def frames(renderer, episodes) -> list[np.ndarray]:
     """`turn` at 5 pictures a second: 41 steps at 50 Hz."""
-    return list(film.render_clip(renderer, episodes[0], target=True, fps=5.0))
+    return list(film.render_clip(renderer, episodes[0], fps=5.0, seconds=0.8))
 
 
-def standing(robot, *, ended: int | None = None) -> Episode:
+def standing(robot, *, ended: int | None = None, fell: int | None = None) -> Episode:
     """The default pose for a second, with the reference a metre to the left."""
     qpos = np.concatenate([[0, 0, robot.default_height, 1, 0, 0, 0], np.asarray(robot.arrays.default_joint_pos)])
     aside = qpos + np.eye(len(qpos))[1]
-    take = Take(qpos=np.tile(qpos, (51, 1)), tracking_reward=np.full(50, 0.75), ended=ended)
-    return Episode(clip="stand", fps=50.0, reference=np.tile(aside, (51, 1)), takes={"base": take})
+    take = Take(np.tile(qpos, (51, 1)), tracking_reward=np.full(50, 0.75), ended=ended, fell=fell, impact=np.zeros(50))
+    return Episode(clip="stand", target=False, fps=50.0, reference=np.tile(aside, (51, 1)), takes={"base": take})
 
 
 def test_a_frame_has_a_header_and_a_pane_a_policy(frames):
@@ -91,10 +90,28 @@ def test_the_empty_floor_has_no_specks(renderer, robot):
         assert floor.min() > 150, "as light as its tiles"
 
 
-def test_a_red_frame_marks_the_end_and_stays(renderer, robot):
-    frames = list(film.render_clip(renderer, standing(robot, ended=20), fps=5.0))
+def test_a_red_frame_marks_a_fall_and_stays(renderer, robot):
+    frames = list(film.render_clip(renderer, standing(robot, ended=10, fell=20), fps=5.0))
     framed = [bool((frame[film.HEADER, 2:-2] == RED).all() and (frame[-1, 2:-2] == RED).all()) for frame in frames]
     assert framed == [False, False, True, True, True, True]  # at 0, 0.2, ... 1.0 s
+
+
+def test_whether_the_robot_stands_is_said_in_green_or_red_once_it_left_the_motion(renderer, robot):
+    def chips(**ends: int) -> list[tuple[bool, bool]]:
+        below = [
+            frame[film.HEADER + 40 : film.HEADER + 65]
+            for frame in film.render_clip(renderer, standing(robot, **ends), fps=5.0)
+        ]
+        return [
+            tuple(
+                bool((np.abs(part.astype(int) - colour).sum(-1) < 60).sum() > 500) for colour in (film.GREEN, film.RED)
+            )
+            for part in below
+        ]
+
+    assert chips() == [(False, False)] * 6
+    assert chips(ended=30) == [(False, False)] * 3 + [(True, False)] * 3
+    assert chips(ended=10, fell=30) == [(False, False), *[(True, False)] * 2, *[(False, True)] * 3]
 
 
 def test_a_film_is_h264_of_the_frames_size_rate_and_number(frames):
@@ -128,15 +145,11 @@ def test_a_contact_sheet_has_a_row_a_clip(frames):
     assert (sheet[:, width : width + gap] == 255).all()
 
 
-def test_a_film_ends_when_there_is_nothing_more_to_see(robot):
+def test_a_film_ends_with_its_episode_or_sooner(robot):
     steps = film.shown_steps
     assert list(steps(standing(robot), fps=10.0)) == list(range(0, 51, 5))
     assert steps(standing(robot), fps=50.0, seconds=0.5)[-1] == 25
-    long = standing(robot, ended=20)
-    long = dataclasses.replace(long, reference=np.tile(long.reference, (10, 1)))
-    assert steps(long, fps=50.0)[-1] == 20 + 75, "1.5 s after the last policy ended"
-    both = dataclasses.replace(long, takes={**long.takes, "other": standing(robot).takes["base"]})
-    assert steps(both, fps=50.0)[-1] == 509
+    assert steps(standing(robot, ended=20, fell=30), fps=50.0)[-1] == 50, "a robot that fell is shown, too"
 
 
 def test_a_robot_without_shapes_to_be_seen_is_drawn_by_those_it_collides_with(robot, monkeypatch):

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from forgetmimic_jax.evaluation.side_by_side import SideBySide
 from forgetmimic_jax.viewing.page import Page
 from forgetmimic_jax.viewing.playback import Playback
-from forgetmimic_jax.viewing.side_by_side import SideBySide
 
 SIZE = {"width": 640, "height": 420}
 SCENE = {"x": 0, "y": 0, "width": 308, "height": 420}  # what the panel of controls leaves
@@ -63,12 +63,12 @@ def test_the_page_opens_a_clip_is_chosen_and_both_robots_move(page, browser, tmp
         # Events rather than clicks, which wait for the page to hold still: on a busy machine that takes minutes.
         view.get_by_role("combobox").first.dispatch_event("click")
         view.get_by_role("option", name="turn (to be forgotten)").dispatch_event("click")
-        view.get_by_text("0.00 of 0.80 s").wait_for()
+        view.get_by_text("0.00 of 3.80 s").wait_for()
         view.wait_for_timeout(2000)  # the scene fades in
         before = picture(view)
         for step in range(1, 11):
             view.get_by_role("button", name="Step", exact=True).dispatch_event("click")
-            view.get_by_text(f"{0.02 * step:.2f} of 0.80 s").wait_for()  # the browser merges events in quick succession
+            view.get_by_text(f"{0.02 * step:.2f} of 3.80 s").wait_for()  # the browser merges events in quick succession
         view.wait_for_timeout(1000)
         after = picture(view)
         view.screenshot(path=tmp_path / "page.png", timeout=PATIENCE)
@@ -99,26 +99,35 @@ def test_the_controls_do_what_they_say(page, library):
 
 def test_it_repeats_only_if_asked_to(page):
     playback = page._playback
-    playback.step = playback.horizon
+    playback.step = playback.last_step
     page._repeat.value = False
     page._advance()
-    assert playback.step == playback.horizon
+    assert playback.step == playback.last_step
     page._repeat.value = True
     page._advance()
     assert playback.step == 0
 
 
-def test_an_end_shows_as_a_red_frame_and_in_words(page):
+def test_a_forgotten_motion_shows_in_words_and_a_fall_as_a_red_frame(page):
     playback = page._playback
+    playback.begin(1)
     playback.step, playback.tracking = 2, [np.array([0.8, 0.8]), np.array([0.6, 0.0])]
     playback.height *= 3
     playback.ended = [None, 1]
     page._show(plots=True)
+    assert [lane._alarm.visible for lane in page._lanes] == [False, False]
+    assert [lane._label.text for lane in page._lanes] == [
+        "base",
+        "unlearned: forgets the motion at 0.02 s, stands 0.04 s",
+    ]
+    playback.fell, playback.impact = [None, 2], np.array([0.0, 3.21])
+    page._show(plots=True)
     assert [lane._alarm.visible for lane in page._lanes] == [False, True]
-    assert [lane._label.text for lane in page._lanes] == ["base", "unlearned: lost the motion at 0.02 s"]
+    fate = "forgets the motion at 0.02 s, falls at 0.04 s, impact 3.2 × its weight"
+    assert [lane._label.text for lane in page._lanes] == ["base", f"unlearned: {fate}"]
     assert page._status.content.splitlines()[1:] == [
-        "- base: **0.70**",
-        "- unlearned: **0.40**, lost the motion at 0.02 s",
+        "- base: **0.70**, stands 0.04 s",
+        f"- unlearned: **0.40**, {fate}",
     ]
 
 
@@ -128,7 +137,7 @@ def test_a_robot_stays_in_the_middle_of_its_floor_facing_the_viewer(page):
     lane, qpos = page._lanes[0], page._playback.qpos[0].copy()
     qpos[:2] = [3.0, -7.0]
     quarter = np.pi / 2.0
-    lane.show(qpos, page._poses(qpos), None, qpos, quarter, None)
+    lane.show(qpos, page._poses(qpos), None, qpos, quarter)
     turn = Rotation.from_quat(lane._world.wxyz, scalar_first=True)
     np.testing.assert_allclose(turn.apply([3.0, -7.0, 0.0]) + lane._world.position, 0.0, atol=1e-6)
     np.testing.assert_allclose(turn.apply([0.0, 1.0, 0.0]), [1.0, 0.0, 0.0], atol=1e-6)  # heading along y

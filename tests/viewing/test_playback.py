@@ -3,8 +3,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from forgetmimic_jax.viewing.playback import AFTER_END_SECONDS, Playback
-from forgetmimic_jax.viewing.side_by_side import SideBySide, record
+from forgetmimic_jax.evaluation.side_by_side import SideBySide
+from forgetmimic_jax.viewing.playback import Playback
+from forgetmimic_jax.viewing.takes import record
 
 
 @pytest.fixture(scope="module")
@@ -23,38 +24,32 @@ def test_it_shows_the_episode_that_a_film_of_the_same_start_shows(playback, libr
 
     alone = jax.tree.map(lambda values: values[1:], library).replace(names=library.names[1:])
     setup = dataclasses.replace(tiny_setup, library=alone)
-    (episode,) = record(setup, {"zero_action": None, "random": policy}, ["turn"], seed=3)
-    while playback.step < playback.horizon:
+    (episode,) = record(setup, {"zero_action": None, "random": policy}, ["turn"], ["turn"], seed=3)
+    while not playback.done:
         playback.advance()
     for row, take in enumerate(episode.takes.values()):
-        assert playback.ended[row] == take.ended
+        assert (playback.ended[row], playback.fell[row]) == (take.ended, take.fell)
+        assert playback.impact[row] == pytest.approx(take.impact.max(), rel=1e-4)
         np.testing.assert_allclose(playback.qpos[row], take.qpos[-1], atol=1e-5)
-        tracking = np.array(playback.tracking)[:, row]
+        tracking = np.array(playback.tracking)[: playback.horizon, row]
         assert tracking.mean() == pytest.approx(take.survival_weighted_tracking, abs=1e-6)
-    assert len(playback.height) == playback.horizon + 1
+    assert len(playback.height) == len(episode.reference) == playback.horizon + 150 + 1
     np.testing.assert_allclose(playback.height[-1], [*playback.qpos[:, 2], episode.reference[-1, 2]], atol=1e-6)
 
 
-def test_it_stops_at_the_clips_end_and_begins_again_where_it_began(playback):
+def test_it_stops_3_s_after_the_clips_end_and_begins_again_where_it_began(playback):
     first = playback.qpos.copy()
-    for _ in range(playback.horizon + 3):
+    for _ in range(playback.horizon + 153):
         playback.advance()
-    assert (playback.step, playback.done) == (40, True)
+    assert (playback.step, playback.done) == (190, True)
+    assert None not in playback.fell
     playback.begin(1)
     np.testing.assert_array_equal(playback.qpos, first)
-    assert (playback.step, playback.done, playback.tracking, playback.ended) == (0, False, [], [None, None])
+    assert (playback.step, playback.done, playback.tracking) == (0, False, [])
+    assert playback.ended == playback.fell == [None, None]
+    assert not playback.impact.any()
     playback.begin(0)
     assert (playback.clip, playback.horizon) == (0, 79)
-
-
-def test_it_is_done_a_while_after_every_policy_lost_the_motion(playback):
-    playback.horizon = 1000
-    playback.ended = [4, 30]
-    after = round(AFTER_END_SECONDS / playback.control_step)
-    for playback.step, done in ((30, False), (29 + after, False), (30 + after, True)):
-        assert playback.done == done
-    playback.ended = [4, None]
-    assert not playback.done
 
 
 def test_a_push_moves_every_robot_the_same_way(stage, robot, playback):

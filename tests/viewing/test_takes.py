@@ -6,7 +6,8 @@ import pytest
 
 from forgetmimic_jax.evaluation.metrics import episode_metrics
 from forgetmimic_jax.evaluation.rollout import Evaluator
-from forgetmimic_jax.viewing.side_by_side import SideBySide, Take, push, record, reference_qpos
+from forgetmimic_jax.evaluation.side_by_side import SideBySide, push
+from forgetmimic_jax.viewing.takes import Take, at, in_words, record, reference_qpos
 
 
 def test_what_is_shown_is_what_the_evaluation_measures(library, tiny_setup, policy, episodes):
@@ -23,7 +24,7 @@ def test_what_is_shown_is_what_the_evaluation_measures(library, tiny_setup, poli
 
 
 def test_an_episode_does_not_depend_on_which_clips_are_chosen(tiny_setup, episodes):
-    (alone,) = record(tiny_setup, {"zero_action": None}, ["sway"], seed=3)
+    (alone,) = record(tiny_setup, {"zero_action": None}, ["sway"], ["turn"], seed=3)
     np.testing.assert_array_equal(alone.takes["zero_action"].qpos, episodes[1].takes["zero_action"].qpos)
 
 
@@ -32,7 +33,44 @@ def test_every_policy_starts_from_the_same_configuration_and_then_goes_its_own_w
         zero, random = episode.takes.values()
         np.testing.assert_array_equal(zero.qpos[0], random.qpos[0])
         assert np.abs(zero.qpos[1] - random.qpos[1]).max() > 1e-5
-        assert len(zero.qpos) == len(episode.reference) == len(zero.tracking_reward) + 1
+        hold = 150 if episode.clip == "turn" else 0  # a target runs on for 3 s
+        assert len(zero.qpos) == len(episode.reference) == len(zero.impact) + 1 == len(zero.tracking_reward) + 1 + hold
+
+
+def test_a_target_runs_on_while_its_last_frame_is_held_and_the_robot_falls(robot, library, episodes):
+    turn, sway = episodes
+    assert (turn.target, sway.target) == (True, False)
+    np.testing.assert_array_equal(turn.reference[:41], reference_qpos(robot, library, 1))
+    np.testing.assert_array_equal(turn.reference[41:], np.tile(turn.reference[40], (150, 1)))
+    for take in turn.takes.values():
+        assert take.ended is not None
+        assert take.ended < take.fell < 150
+        below = take.qpos[:, 2] < 0.38  # half of the standing height; the robot may be tilted before
+        assert take.fell <= below.argmax() < take.fell + 50
+        assert take.impact[: take.ended].max() == 0.0
+        assert take.impact.max() > 1.0
+
+
+def test_an_episode_in_words():
+    def words(policy: str, target: bool, fell: float | None, impact: float = 0.0, ended: float | None = 0.4):
+        return in_words(policy, target=target, ended=ended, fell=fell, now=2.0, impact=impact)
+
+    assert words("stand", True, None) == ("forgets the motion at 0.40 s", "stands 2.00 s")
+    assert words("arft", True, 0.6, 7.25) == (
+        "forgets the motion at 0.40 s",
+        "falls at 0.60 s, impact 7.2 × its weight",
+    )
+    assert words("base", True, None) == ("leaves the motion at 0.40 s", "stands 2.00 s")
+    assert words("stand", False, None) == ("leaves the motion at 0.40 s", "stands 2.00 s")
+    assert words("stand", True, None, ended=None) == ("", "stands 2.00 s")
+
+
+def test_words_know_nothing_of_what_comes_later(episodes):
+    take = episodes[0].takes["random"]
+    assert at(episodes[0], "random", take.ended - 1) == ("", f"stands {(take.ended - 1) / 50:.2f} s")
+    follows, stands = at(episodes[0], "random", take.fell)
+    assert follows == f"forgets the motion at {take.ended / 50:.2f} s"
+    assert stands.startswith(f"falls at {take.fell / 50:.2f} s")
 
 
 def test_the_reference_is_the_clip_itself(robot, library):
@@ -45,7 +83,8 @@ def test_the_reference_is_the_clip_itself(robot, library):
 
 
 def test_zeros_count_after_the_end():
-    take = Take(qpos=np.zeros((5, 36)), tracking_reward=np.array([0.8, 0.6, 0.9, 0.9]), ended=2)
+    reward = np.array([0.8, 0.6, 0.9, 0.9])
+    take = Take(qpos=np.zeros((5, 36)), tracking_reward=reward, ended=2, fell=None, impact=np.zeros(4))
     assert take.survival_weighted_tracking == pytest.approx(1.4 / 4)
     assert dataclasses.replace(take, ended=None).survival_weighted_tracking == pytest.approx(3.2 / 4)
 
