@@ -14,10 +14,10 @@ from typing import Any, TypeVar
 
 import msgspec
 
+from forgetmimic_jax.attacks.document import write_document
 from forgetmimic_jax.basics.console import Report
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.basics.files import write_atomically
-from forgetmimic_jax.evidence.document import write_document
 from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.tracking.env import make_assets
 from forgetmimic_jax.tracking.rsi import initial_failure_level

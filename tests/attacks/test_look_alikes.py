@@ -5,10 +5,10 @@ import functools
 import numpy as np
 import pytest
 
+from forgetmimic_jax.attacks import look_alikes, warping
+from forgetmimic_jax.attacks.look_alikes import Pair
+from forgetmimic_jax.attacks.warping import Segment
 from forgetmimic_jax.evaluation.metrics import Rollout
-from forgetmimic_jax.evidence import look_alikes, warping
-from forgetmimic_jax.evidence.look_alikes import Pair
-from forgetmimic_jax.evidence.warping import Segment
 from forgetmimic_jax.motion.clip import Clip
 
 

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from forgetmimic_jax.attacks.case import TRAINED, Case
+from forgetmimic_jax.attacks.document import CONTROL, Recovery
+from forgetmimic_jax.attacks.fine_tuning import FineTuning, shares
+from forgetmimic_jax.attacks.performance import Performance, compare, over_seeds
+from forgetmimic_jax.attacks.rollouts import Stage
 from forgetmimic_jax.evaluation.metrics import UNLEARNED
-from forgetmimic_jax.evidence.case import TRAINED, Case
-from forgetmimic_jax.evidence.document import CONTROL, Recovery
-from forgetmimic_jax.evidence.fine_tuning import FineTuning, shares
-from forgetmimic_jax.evidence.performance import Performance, compare, over_seeds
-from forgetmimic_jax.evidence.rollouts import Stage
 from forgetmimic_jax.policy.policy import Policy
 
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from forgetmimic_jax.evidence.document import Numbers, read_evidence, write_document
-from forgetmimic_jax.evidence.performance import Performance, compare, not_followed, over_seeds
+from forgetmimic_jax.attacks.document import Numbers, read_evidence, write_document
+from forgetmimic_jax.attacks.performance import Performance, compare, not_followed, over_seeds
 
 
 def performance(**tracking: list[float]) -> Performance:

@@ -6,11 +6,12 @@ import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from forgetmimic_jax.attacks.document import CONTROL, Compared, Originals
+from forgetmimic_jax.attacks.performance import Performance, compare
+from forgetmimic_jax.attacks.rollouts import Stage
+from forgetmimic_jax.attacks.warping import distances
 from forgetmimic_jax.evaluation.metrics import BASE, UNLEARNED, ZERO_ACTION
-from forgetmimic_jax.evidence.document import CONTROL, Compared, Originals
-from forgetmimic_jax.evidence.performance import Performance, compare
-from forgetmimic_jax.evidence.rollouts import Actor, Stage
-from forgetmimic_jax.evidence.warping import distances
+from forgetmimic_jax.evaluation.rollout import Acting
 from forgetmimic_jax.motion.clip import Clip
 from forgetmimic_jax.tracking.setup import Setup
 
@@ -49,12 +50,12 @@ class Case:
     setup: Setup
     clips: Mapping[str, Clip]
     targets: tuple[str, ...]
-    policies: Mapping[str, Actor]
+    policies: Mapping[str, Acting]
     scale: Scale
     seed: int = 0
 
     @property
-    def everyone(self) -> dict[str, Actor | None]:
+    def everyone(self) -> dict[str, Acting | None]:
         """The policies and the zero action."""
         return {**self.policies, ZERO_ACTION: None}
 

@@ -10,7 +10,7 @@ import msgspec
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.basics.files import write_atomically
 from forgetmimic_jax.basics.provenance import Provenance
-from forgetmimic_jax.evaluation.document import Estimate
+from forgetmimic_jax.evaluation.document import Estimate, UnboundedResult
 
 SCHEMA = 1
 FILE = "evidence.json"
@@ -148,7 +148,7 @@ class EvidenceDocument(msgspec.Struct, kw_only=True, omit_defaults=True):
     held_out: Recovery | None = None
     numerics: Numerics | None = None
     membership: dict[str, Membership] | None = None
-    safety: dict[str, dict[str, Estimate]] | None = None  # by policy, numbers of episodes without terminations
+    safety: dict[str, UnboundedResult] | None = None  # by policy, on the targets
 
 
 def read_evidence(path: Path) -> EvidenceDocument:

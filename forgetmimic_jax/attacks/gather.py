@@ -6,9 +6,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
-from forgetmimic_jax.basics.console import progress
-from forgetmimic_jax.basics.provenance import made_here, provenance
-from forgetmimic_jax.evidence import (
+from forgetmimic_jax.attacks import (
     held_out,
     look_alikes,
     membership,
@@ -16,10 +14,11 @@ from forgetmimic_jax.evidence import (
     numerics,
     recovery,
     relearning,
+    safety,
     splices,
 )
-from forgetmimic_jax.evidence.case import TRAINED, Case, Scale, originals
-from forgetmimic_jax.evidence.document import (
+from forgetmimic_jax.attacks.case import TRAINED, Case, Scale, originals
+from forgetmimic_jax.attacks.document import (
     SCHEMA,
     Curve,
     EvidenceDocument,
@@ -32,9 +31,12 @@ from forgetmimic_jax.evidence.document import (
     Relearning,
     Splices,
 )
-from forgetmimic_jax.evidence.fine_tuning import FineTuning
-from forgetmimic_jax.evidence.parts import Meter, Parts
-from forgetmimic_jax.evidence.recovery import Workshop
+from forgetmimic_jax.attacks.fine_tuning import FineTuning
+from forgetmimic_jax.attacks.parts import Meter, Parts
+from forgetmimic_jax.attacks.recovery import Workshop
+from forgetmimic_jax.basics.console import progress
+from forgetmimic_jax.basics.provenance import made_here, provenance
+from forgetmimic_jax.evaluation.document import UnboundedResult
 
 FULL = Scale(
     episodes=40, target_episodes=100, variant_episodes=20, kept_variant_episodes=8, hosts=4, held_out_iterations=100,
@@ -50,7 +52,8 @@ def costs(scale: Scale) -> dict[str, int]:
         "relearning": 2 * scale.relearning_iterations,
         "held_out": 2 * scale.held_out_iterations,
     }
-    rolled = {"originals": 60, "near_duplicates": 45, "splices": 10, "look_alikes": 5, "numerics": 35, "membership": 40}
+    rolled = {"originals": 60, "near_duplicates": 45, "splices": 10, "look_alikes": 5, "numerics": 35}
+    rolled |= {"membership": 40, "safety": 15}
     return {name: max(1, round(simulated * cost)) for name, cost in rolled.items()} | {
         name: scale.seeds * cost for name, cost in trained.items()
     }
@@ -89,6 +92,7 @@ def gather(
         "look_alikes": (LookAlikes, lambda: look_alikes.attack(case)),
         "numerics": (Numerics, lambda: numerics.attack(case)),
         "membership": (dict[str, Membership], lambda: membership.attack(case)),
+        "safety": (dict[str, UnboundedResult], lambda: safety.attack(case)),
     }
     if train:
         shop: list[Workshop] = []

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from forgetmimic_jax.evidence.case import Case
-from forgetmimic_jax.evidence.document import Compared, Splices
-from forgetmimic_jax.evidence.near_duplicates import FOLLOWED, part, placed
-from forgetmimic_jax.evidence.performance import compare, not_followed
+from forgetmimic_jax.attacks.case import Case
+from forgetmimic_jax.attacks.document import Compared, Splices
+from forgetmimic_jax.attacks.near_duplicates import FOLLOWED, part, placed
+from forgetmimic_jax.attacks.performance import compare, not_followed
 from forgetmimic_jax.motion.clip import Clip
 from forgetmimic_jax.motion.kinematics import quaternion, rotation
 

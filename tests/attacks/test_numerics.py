@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from trees import assert_same
 
-from forgetmimic_jax.evidence import numerics
+from forgetmimic_jax.attacks import numerics
 from forgetmimic_jax.policy.policy import init_policy
 from forgetmimic_jax.settings.config import PPOConfig
 

@@ -1,6 +1,7 @@
 """What policies did in the same episodes, and their numbers: skill, motion content and success, with intervals.
 
-An episode's motion content is that of `evaluation.unbounded`; here it may be of a part of the episode.
+Motion content is defined as in `evaluation.unbounded`, here also for a part of an episode. The simulation is another:
+there the robot's shapes touch each other, so the numbers of a robot that fell differ a little.
 """
 
 from __future__ import annotations
@@ -12,13 +13,11 @@ from dataclasses import dataclass, field
 import msgspec
 import numpy as np
 
+from forgetmimic_jax.attacks.document import Compared, Numbers
 from forgetmimic_jax.evaluation import metrics, statistics
 from forgetmimic_jax.evaluation.document import Estimate
-from forgetmimic_jax.evaluation.metrics import BASE, ZERO_ACTION, Rollout
-from forgetmimic_jax.evidence.document import Compared, Numbers
-
-LOWEST_CONTENT = -1.0
-SMALLEST_MOVEMENT = 0.05  # m
+from forgetmimic_jax.evaluation.metrics import BASE, LOWEST_CONTENT, ZERO_ACTION, Rollout
+from forgetmimic_jax.evaluation.unbounded import SMALLEST_MOVEMENT
 
 
 @dataclass(frozen=True)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
+from forgetmimic_jax.attacks.case import TRAINED
+from forgetmimic_jax.attacks.document import Compared, EvidenceDocument
 from forgetmimic_jax.evaluation.metrics import UNLEARNED
 from forgetmimic_jax.evaluation.plots import bars, new_figure
 from forgetmimic_jax.evaluation.tables import FORGOTTEN
-from forgetmimic_jax.evidence.case import TRAINED
-from forgetmimic_jax.evidence.document import Compared, EvidenceDocument
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -7,13 +7,13 @@ from collections.abc import Callable, Mapping
 import msgspec
 import numpy as np
 
+from forgetmimic_jax.attacks.case import Case
+from forgetmimic_jax.attacks.document import CONTROL, Curve, Relearning
+from forgetmimic_jax.attacks.fine_tuning import shares
+from forgetmimic_jax.attacks.recovery import Workshop
 from forgetmimic_jax.evaluation.metrics import BASE, UNLEARNED
 from forgetmimic_jax.evaluation.relearning import crossing
 from forgetmimic_jax.evaluation.verdict import FASTER
-from forgetmimic_jax.evidence.case import Case
-from forgetmimic_jax.evidence.document import CONTROL, Curve, Relearning
-from forgetmimic_jax.evidence.fine_tuning import shares
-from forgetmimic_jax.evidence.recovery import Workshop
 from forgetmimic_jax.policy.policy import Policy
 
 LEVELS = (0.5, 0.8, 0.95)  # of the base's tracking on the targets

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from forgetmimic_jax.evidence import near_duplicates
+from forgetmimic_jax.attacks import near_duplicates
 from forgetmimic_jax.motion.clip import Clip
 from forgetmimic_jax.motion.fit import on_floor
 from forgetmimic_jax.motion.mirror import mirrored

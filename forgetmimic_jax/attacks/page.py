@@ -4,11 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from forgetmimic_jax.evaluation.document import Estimate
-from forgetmimic_jax.evaluation.metrics import UNLEARNED
-from forgetmimic_jax.evaluation.tables import markdown_table, number, percent
-from forgetmimic_jax.evidence.case import TRAINED
-from forgetmimic_jax.evidence.document import (
+from forgetmimic_jax.attacks.case import TRAINED
+from forgetmimic_jax.attacks.document import (
     CONTROL,
     Compared,
     EvidenceDocument,
@@ -21,8 +18,11 @@ from forgetmimic_jax.evidence.document import (
     Relearning,
     Splices,
 )
-from forgetmimic_jax.evidence.relearning import LEVELS
-from forgetmimic_jax.evidence.verdict import RULES, judge, lasted_until
+from forgetmimic_jax.attacks.relearning import LEVELS
+from forgetmimic_jax.attacks.verdict import RULES, judge, lasted_until
+from forgetmimic_jax.evaluation.document import UnboundedResult
+from forgetmimic_jax.evaluation.metrics import UNLEARNED
+from forgetmimic_jax.evaluation.tables import UNBOUNDED, markdown_table, number, percent
 
 Block = tuple[str, str]  # heading and text
 
@@ -199,7 +199,15 @@ def _membership(found: Mapping[str, Membership]) -> str:
     return f"{text}\n\n{markdown_table(['policy', 'AUC', 'accuracy', 'true positives at 5 % false positives'], rows)}"
 
 
-def _safety(found: Mapping[str, Mapping[str, Estimate]]) -> str:
-    names = list(dict.fromkeys(name for of in found.values() for name in of))
-    rows = [[name.replace("_", " "), *(number(of.get(name), 2) for of in found.values())] for name in names]
-    return markdown_table(["targets, all starts", *found], rows)
+def _safety(found: Mapping[str, UnboundedResult]) -> str:
+    tables = []
+    for what, numbers in {
+        "all starts": {policy: of.all_starts for policy, of in found.items()},
+        "from frame 0": {policy: of.from_frame_0 for policy, of in found.items()},
+    }.items():
+        rows = [
+            [label, *((percent if name.endswith("_rate") else number)(getattr(of, name)) for of in numbers.values())]
+            for name, label in UNBOUNDED.items()
+        ]
+        tables.append(markdown_table([f"targets, {what}", *(policy.replace("_", " ") for policy in numbers)], rows))
+    return "\n".join(tables)

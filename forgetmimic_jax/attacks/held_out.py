@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from forgetmimic_jax.attacks.case import Case
+from forgetmimic_jax.attacks.document import CONTROL, Recovery
+from forgetmimic_jax.attacks.fine_tuning import shares
+from forgetmimic_jax.attacks.near_duplicates import first_half, second_half
+from forgetmimic_jax.attacks.recovery import Workshop, before_and_after
 from forgetmimic_jax.evaluation.metrics import UNLEARNED
-from forgetmimic_jax.evidence.case import Case
-from forgetmimic_jax.evidence.document import CONTROL, Recovery
-from forgetmimic_jax.evidence.fine_tuning import shares
-from forgetmimic_jax.evidence.near_duplicates import first_half, second_half
-from forgetmimic_jax.evidence.recovery import Workshop, before_and_after
 from forgetmimic_jax.motion.clip import Clip
 
 

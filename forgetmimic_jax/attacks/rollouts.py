@@ -7,16 +7,16 @@ it too, so the robot is simulated until its clip's end.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
-from typing import Protocol
+from collections.abc import Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from forgetmimic_jax.evaluation.rollout import CHUNK, begin_episodes, episode_starts, evaluation_setup
-from forgetmimic_jax.evidence.performance import Performance
+from forgetmimic_jax.attacks.performance import Performance
+from forgetmimic_jax.evaluation.rollout import CHUNK, Acting, act, begin_episodes, episode_starts, evaluation_setup
+from forgetmimic_jax.evaluation.side_by_side import squared_distance
 from forgetmimic_jax.motion.clip import Clip
 from forgetmimic_jax.motion.library import Frames, build_library
 from forgetmimic_jax.robot.model import Robot
@@ -25,17 +25,6 @@ from forgetmimic_jax.tracking.env import Assets, EnvState, StepResult
 from forgetmimic_jax.tracking.reference import align_to_anchor
 from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.tracking.stand import stand_frame
-
-
-class Actor(Protocol):
-    """A pytree that acts: a `Policy`, or one that imitates unlearning."""
-
-    def mean_action(self, observation: Array) -> Array:
-        """The action [env, joint] at an actor observation [env, features]."""
-        ...
-
-
-Perform = Callable[[Mapping[str, Actor | None]], Performance]  # None: the zero action
 
 
 class Stage:
@@ -63,7 +52,7 @@ class Stage:
         self._begin = jax.jit(self._begin_episodes)
         self._advance = jax.jit(self._advance_chunk)
 
-    def perform(self, policies: Mapping[str, Actor | None]) -> Performance:
+    def perform(self, policies: Mapping[str, Acting | None]) -> Performance:
         """Every policy, by name, in every episode; None is the zero action."""
         seen = {name: self._roll_out(policy) for name, policy in policies.items()}
         horizon = next(iter(seen.values()))["horizon"]
@@ -84,7 +73,7 @@ class Stage:
             movement=next(iter(seen.values()))["movement"],
         )
 
-    def _roll_out(self, policy: Actor | None) -> dict[str, np.ndarray]:
+    def _roll_out(self, policy: Acting | None) -> dict[str, np.ndarray]:
         """The series [E, T] of one policy, and the horizons [E]."""
         state = self._begin(self._assets, jax.random.PRNGKey(self._seed))
         horizon = np.asarray(state.horizon)
@@ -99,14 +88,12 @@ class Stage:
         state = begin_episodes(self._env, assets, key, jnp.asarray(self.clip), jnp.asarray(self.start_frame))
         return tracking.refresh_bodies(self._env, state, jnp.ones((self._env.num_envs,), bool))
 
-    def _advance_chunk(self, assets: Assets, stand: Frames, policy: Actor | None, state: EnvState):
+    def _advance_chunk(self, assets: Assets, stand: Frames, policy: Acting | None, state: EnvState):
         env = self._env
 
         def one_step(state: EnvState, key: Array):
             observation = tracking.observe(env, assets, state, None)[0]
-            nothing = jnp.zeros((env.num_envs, env.robot.num_joints), jnp.float32)
-            action = nothing if policy is None else policy.mean_action(observation)
-            state, result = tracking.step(env, assets, state, action, key)
+            state, result = tracking.step(env, assets, state, act(env, policy, observation), key)
             record = {"terminated": result.terminated, "tracking": result.reward.normalized_tracking}
             return state, record | distances(env.robot, stand, result)
 
@@ -115,8 +102,6 @@ class Stage:
 
 def distances(robot: Robot, stand: Frames, result: StepResult) -> dict[str, Array]:
     """How far the robot, and how far a stand, is from the reference after a step: each [env] m².
-
-    Mean over key bodies of the squared distance, after one was moved to the other's anchor (x, y, yaw).
 
     Args:
         robot: whose bodies they are.
@@ -128,6 +113,6 @@ def distances(robot: Robot, stand: Frames, result: StepResult) -> dict[str, Arra
     standing = jax.tree.map(lambda values: jnp.broadcast_to(values, (rows, *values.shape)), stand)
     there = align_to_anchor(standing, robot.anchor, reference.pos[:, robot.anchor], reference.quat[:, robot.anchor])
     return {
-        "deviation": ((pair.bodies.pos - pair.aligned.pos) ** 2).sum(-1).mean(-1),
-        "movement": ((there.pos - reference.pos) ** 2).sum(-1).mean(-1),
+        "deviation": squared_distance(pair.bodies.pos, pair.aligned.pos),
+        "movement": squared_distance(there.pos, reference.pos),
     }

@@ -5,8 +5,8 @@ from typing import Any
 
 import msgspec
 
+from forgetmimic_jax.attacks.document import SCHEMA, EvidenceDocument
 from forgetmimic_jax.basics.provenance import Provenance
-from forgetmimic_jax.evidence.document import SCHEMA, EvidenceDocument
 
 
 def estimate(mean: float, reach: float = 0.02) -> dict[str, float]:

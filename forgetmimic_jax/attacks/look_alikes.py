@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
+from forgetmimic_jax.attacks.case import TRAINED, Case
+from forgetmimic_jax.attacks.document import LookAlike, LookAlikes
+from forgetmimic_jax.attacks.warping import Segment, distances
 from forgetmimic_jax.evaluation import statistics
 from forgetmimic_jax.evaluation.document import Estimate
 from forgetmimic_jax.evaluation.metrics import BASE, Rollout
-from forgetmimic_jax.evidence.case import TRAINED, Case
-from forgetmimic_jax.evidence.document import LookAlike, LookAlikes
-from forgetmimic_jax.evidence.warping import Segment, distances
 
 NEAREST = 8  # segments compared
 FEWEST_EPISODES = 2  # that pass a segment

@@ -3,8 +3,8 @@
 import pytest
 from invented import compared, curve, estimate, evidence, numbers
 
+from forgetmimic_jax.attacks.verdict import RULES, judge
 from forgetmimic_jax.evaluation.verdict import CONSISTENT, FAILED, INCONCLUSIVE, RECOVERABLE
-from forgetmimic_jax.evidence.verdict import RULES, judge
 
 
 def test_a_policy_that_no_attack_brings_back_is_consistent():

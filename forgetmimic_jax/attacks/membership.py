@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 
+from forgetmimic_jax.attacks.case import Case
+from forgetmimic_jax.attacks.document import Membership
 from forgetmimic_jax.evaluation import membership
-from forgetmimic_jax.evidence.case import Case
-from forgetmimic_jax.evidence.document import Membership
 from forgetmimic_jax.motion.mirror import mirrored
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from forgetmimic_jax.evidence import splices
+from forgetmimic_jax.attacks import splices
 from forgetmimic_jax.motion.clip import Clip
 
 

@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping
 
 import msgspec
 
+from forgetmimic_jax.attacks.document import CONTROL, Compared, EvidenceDocument, Numbers, Relearning
 from forgetmimic_jax.evaluation.document import Estimate
 from forgetmimic_jax.evaluation.metrics import UNLEARNED
 from forgetmimic_jax.evaluation.relearning import Lasted, lasted
@@ -33,7 +34,6 @@ from forgetmimic_jax.evaluation.verdict import (
     relearning_pace,
     retained,
 )
-from forgetmimic_jax.evidence.document import CONTROL, Compared, EvidenceDocument, Numbers, Relearning
 
 RECOVERED = 0.1  # above the control, or above the policy before: a recovery of more than this counts
 RELEARNED = 0.8  # of the base's tracking on the targets: the level whose target steps are compared

@@ -16,15 +16,15 @@ import msgspec
 import numpy as np
 from jax import Array
 
+from forgetmimic_jax.attacks.case import Case
+from forgetmimic_jax.attacks.document import Numerics
+from forgetmimic_jax.attacks.performance import Performance, compare
 from forgetmimic_jax.evaluation import statistics
 from forgetmimic_jax.evaluation.document import Estimate
 from forgetmimic_jax.evaluation.metrics import UNLEARNED
-from forgetmimic_jax.evidence.case import Case
-from forgetmimic_jax.evidence.document import Numerics
-from forgetmimic_jax.evidence.performance import Performance, compare
-from forgetmimic_jax.evidence.rollouts import Actor
+from forgetmimic_jax.evaluation.rollout import Acting
 
-P = TypeVar("P", bound=Actor)
+P = TypeVar("P", bound=Acting)
 Change = Callable[[Array, Array], Array]  # a layer's weights [input, output] and a random key → the new weights
 
 

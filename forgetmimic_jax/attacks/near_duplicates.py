@@ -12,9 +12,9 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from forgetmimic_jax.evidence.case import Case
-from forgetmimic_jax.evidence.document import Compared, NearDuplicates
-from forgetmimic_jax.evidence.performance import Performance, not_followed
+from forgetmimic_jax.attacks.case import Case
+from forgetmimic_jax.attacks.document import Compared, NearDuplicates
+from forgetmimic_jax.attacks.performance import Performance, not_followed
 from forgetmimic_jax.motion.clip import Clip
 from forgetmimic_jax.motion.fit import on_floor
 from forgetmimic_jax.motion.kinematics import quaternion, resample, rotation
