@@ -55,6 +55,7 @@ def main(options: Options) -> None:
     from forgetmimic_jax.attacks.verdict import judge
     from forgetmimic_jax.basics.console import closing, command_line
     from forgetmimic_jax.basics.files import write_atomically
+    from forgetmimic_jax.basics.provenance import provenance
     from forgetmimic_jax.evaluation.metrics import BASE, UNLEARNED
     from forgetmimic_jax.evaluation.plots import save
     from forgetmimic_jax.motion.kinematics import resample
@@ -64,6 +65,7 @@ def main(options: Options) -> None:
     from forgetmimic_jax.training.comparison import load_comparison
     from forgetmimic_jax.training.folder import check_writable
 
+    provenance()  # of the code that is loaded now; a checkout may change while attacks train
     run, scale = options.run, _scale(options)
     newest = checkpoint.newest_checkpoint(run)
     if newest is None:
