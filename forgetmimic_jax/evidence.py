@@ -5,13 +5,15 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from forgetmimic_jax.basics.errors import InputError, Interrupted, run_command
 from forgetmimic_jax.settings.options import at_least, parse
 
 if TYPE_CHECKING:
-    from forgetmimic_jax.attacks.case import Scale
+    from forgetmimic_jax.attacks.case import Case, Scale
+    from forgetmimic_jax.attacks.document import EvidenceDocument
+    from forgetmimic_jax.attacks.parts import Parts
     from forgetmimic_jax.training.checkpoint import CheckpointInfo
 
 
@@ -40,6 +42,8 @@ class Options:
     """Iterations of relearning at most; 300 by default."""
     control_iterations: int | None = None
     """Iterations of a control that is made; the method's by default."""
+    fakes: bool = False
+    """Judge the judge too: six fakes, which must fail, and another distilled policy, which must not (an hour)."""
 
 
 def main(options: Options) -> None:
@@ -77,7 +81,7 @@ def main(options: Options) -> None:
     compared = load_comparison(newest, robot=info.robot, base=options.base)
     setup, base = compared.setup, compared.info["base"]
     beside = options.control or control.beside(run)
-    if options.control is None and not control.is_finished(beside):
+    if options.control is None:
         _make_control(options, info, base.path, beside)
     other = control.read_control(beside, info, setup)
     own = next(name for name in compared.policies if name != "base")
@@ -93,10 +97,11 @@ def main(options: Options) -> None:
     }
     case = Case(setup, clips, compared.targets, policies, scale, seed=0)
     policy_hashes = {name: checkpoint.policy_hash(of) for name, of in hashes.items()}
+    parts = Parts(run / "evidence", setup, gather.conditions(case, policy_hashes))
     try:
         document = gather.gather(
             case,
-            Parts(run / "evidence", setup, gather.conditions(case, policy_hashes)),
+            parts,
             method=info.config.unlearn.method,
             control_method=other.config.unlearn.method,
             policy_hashes=policy_hashes,
@@ -109,6 +114,8 @@ def main(options: Options) -> None:
     given = {field.name: getattr(options, field.name) or None for field in dataclasses.fields(options)}
     command = command_line("evidence", **{name.replace("_", "-"): value for name, value in given.items()})
     write_atomically(files["page"], page(document, files["figure"].name, command).encode())
+    if options.fakes:
+        files["fakes"] = _judge_fakes(options, case, parts, document, info, base.path)
     verdict = judge(document)
     console = Console()
     console.print(f"{verdict.phrase}: {' '.join(verdict.reasons)}", highlight=False, markup=False, soft_wrap=True)
@@ -139,27 +146,73 @@ def _scale(options: Options) -> Scale:
 
 
 def _make_control(options: Options, info: CheckpointInfo, base: Path, folder: Path) -> None:
-    """Distil a control, or continue one that was stopped: with another seed than the run's, which may be distilled."""
+    """Distil a control: with another seed than the run's, which may be distilled itself."""
+    from forgetmimic_jax.attacks import control
+
+    given = {"method": control.METHOD, "iterations": options.control_iterations, "seed": info.config.seed + 1}
+    _unlearn(info, base, folder, **given)
+
+
+def _unlearn(info: CheckpointInfo, base: Path, folder: Path, **given: Any) -> None:
+    """A run on the robot, base, clips and targets of another, unless it is finished; one that stopped continues."""
     from forgetmimic_jax import unlearn
     from forgetmimic_jax.attacks import control
     from forgetmimic_jax.training.checkpoint import newest_checkpoint, read_info
 
+    if control.is_finished(folder):
+        return
     config = info.config
     unlearn.main(
         unlearn.Options(
             robot=config.robot,
             targets=",".join(config.unlearn.targets),
-            method=control.METHOD,
             preset=config.preset if config.preset != read_info(base).config.preset else None,  # type: ignore[arg-type]
-            iterations=options.control_iterations,
-            seed=config.seed + 1,
             base=base,
             physics=config.physics.engine,
             library=None if config.library is None else Path(config.library),
             output=folder,
             resume=newest_checkpoint(folder) is not None,
+            **given,
         )
     )
+
+
+def _judge_fakes(
+    options: Options, case: Case, parts: Parts, evidence: EvidenceDocument, info: CheckpointInfo, base: Path
+) -> Path:
+    """The verdict on every fake and on another distilled policy, in fakes.md."""
+    from rich.console import Console
+
+    from forgetmimic_jax.attacks import control
+    from forgetmimic_jax.attacks.fakes import fakes
+    from forgetmimic_jax.attacks.judged import Judged, judged, table
+    from forgetmimic_jax.basics.files import write_atomically
+    from forgetmimic_jax.evaluation.metrics import BASE
+    from forgetmimic_jax.policy.policy import Policy
+    from forgetmimic_jax.training import checkpoint
+
+    def trained(name: str, **given: Any) -> Policy:
+        folder = options.run.with_name(f"{options.run.name}-{name}")
+        _unlearn(info, base, folder, **given)
+        newest = checkpoint.newest_checkpoint(folder)
+        assert newest is not None
+        return checkpoint.load_policy(checkpoint.read_info(newest), case.setup.robot)
+
+    own = case.policies[BASE]
+    assert isinstance(own, Policy)
+    seed, iterations = info.config.seed, options.control_iterations
+    policies = {
+        **fakes(case.setup, own, case.chosen(case.targets), case.chosen(case.kept)),
+        "λ = 8": lambda: trained("lambda-8", penalty=8.0, iterations=iterations, seed=seed),
+        "distilled again": lambda: trained("distilled", method=control.METHOD, iterations=iterations, seed=seed + 2),
+    }
+    found: dict[str, Judged] = {}
+    for name, make in policies.items():
+        found[name] = judged(case, parts, name, make(), evidence)
+        Console().print(f"{name}: {found[name].phrase}", highlight=False, markup=False)
+    path = options.run / "fakes.md"
+    write_atomically(path, f"# Judging the judge\n\n{table(found)}".encode())
+    return path
 
 
 if __name__ == "__main__":

@@ -45,7 +45,6 @@ def world(small_setup, toy_clips, robot):
     base = toy.Near(other, known, frames, toy.WIDE, 1.0)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cases, "Stage", toy.ToyStage)
-        patch.setattr(toy.ToyStage, "base", base)
         yield {"base": base, "control": known, "frames": frames, "target network": other}
 
 

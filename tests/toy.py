@@ -56,7 +56,7 @@ class Near:
 class ToyStage:
     """Has the interface of `attacks.rollouts.Stage`."""
 
-    base = None  # what is right, set by the test
+    base = None  # what is right: the latest base that performed
 
     def __init__(self, setup, clips, *, episodes, seed, from_start=False):
         self.names = tuple(clip.name for clip in clips)
