@@ -11,7 +11,7 @@
 ## LIBRARY      folder of clips (default: data/ROBOT)
 ## BASE         the policy to start from (default: the shipped one; for pretrain and train, none)
 ## CHECKPOINT   the policy to evaluate, export, play or film (default: the shipped base)
-## RUN          folder of the run to report on
+## RUN          folder of the run to attack, or to report on
 ## OUTPUT       where the results go (default: under runs/)
 ## RESUME       1 continues the run in OUTPUT
 ## SWEEP        lambda, targets, sampler or seeds (default: lambda)
@@ -19,7 +19,7 @@
 ## ARGS         flags as they are, and what comes before them; ARGS=--help lists all flags
 ## PYTHON       the Python that .venv is made from, 3.11 to 3.14 (default: the first found)
 PROGRAM = .venv/bin/python -m forgetmimic_jax
-SWITCHES = RESUME WRENCH DRAW DRY FORCE MIX_COMMITS NO_STOP
+SWITCHES = RESUME WRENCH DRAW DRY FORCE MIX_COMMITS NO_STOP FULL FAKES
 
 # The variables of the command line as flags; a switch has no value.
 given = $(foreach name,$(.VARIABLES),$(if $(filter command,$(origin $(name))),$(name)))
@@ -28,7 +28,7 @@ flag_value = $(if $(filter $(1),$(SWITCHES)),$(filter-out 1,$($(1))),'$(subst ',
 flag = $(if $($(1)),--$(call flag_name,$(1)) $(call flag_value,$(1)))
 FLAGS = $(foreach name,$(filter-out ARGS PYTHON SWEEP,$(given)),$(call flag,$(name)))
 
-COMMANDS = pretrain train unlearn evaluate export play video report motions robot bench
+COMMANDS = pretrain train unlearn evaluate evidence export play video report motions robot bench
 STUDIES = validity comparison penalty heat_map motion_types physical_behaviour training_dynamics relearning membership \
 	number_of_targets
 
@@ -48,6 +48,7 @@ pretrain: ## train a base policy on every clip of LIBRARY, in phases, unattended
 train: ## train by plain PPO, as the paper does
 unlearn: ## forget TARGETS, then evaluate base and unlearned policy side by side
 evaluate: ## evaluate CHECKPOINT clip by clip
+evidence: ## try to bring back what the run in RUN forgot, and judge it (20 minutes; ARGS=--full: hours)
 export: ## write CHECKPOINT as ONNX for deploy tools, checked in plain MuJoCo
 play: ## watch CHECKPOINT live in a web page, beside its base
 video: ## film CHECKPOINT clip by clip, beside its base: MP4, GIF and a page of stills

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 class Options:
     """Describe an unlearning run on one self-contained HTML page, with the same facts as JSON beside it.
 
-    Every number comes from the run's own files; the verdict is one of four phrases, whose rules the page states.
+    Every number comes from the run's own files. The verdict is one of four phrases, whose rules the page states: from
+    evidence.json of `make evidence` if the run has one, else from the evaluation and the comparisons named here.
     """
 
     run: Path
@@ -40,6 +41,7 @@ def main(options: Options) -> None:
     """Read and check, judge, film and write."""
     from rich.console import Console
 
+    from forgetmimic_jax.attacks import verdict as attacks
     from forgetmimic_jax.basics.console import closing, command_line
     from forgetmimic_jax.basics.files import write_atomically
     from forgetmimic_jax.evaluation import tables
@@ -57,9 +59,15 @@ def main(options: Options) -> None:
         raise InputError(f"--output: found {output}; accepted: an .html file")
     subject = read_subject(options.run, options.base)
     check_writable(output.parent)
-    control = comparisons.read_control(options.control, subject)
-    relearning = comparisons.read_relearning(options.relearning, subject, options.control)
-    verdict = judge(subject.document.policies, control=control, relearning=relearning)
+    evidence = comparisons.read_own_evidence(subject)
+    if evidence is None:
+        control = comparisons.read_control(options.control, subject)
+        relearning = comparisons.read_relearning(options.relearning, subject, options.control)
+        verdict, rules = judge(subject.document.policies, control=control, relearning=relearning), RULES
+        missing = facts.missing(control, relearning)
+    else:
+        comparisons.check_alone(options.control, options.relearning, subject)
+        verdict, rules, missing = attacks.judge(evidence), attacks.RULES, []
     found: dict[str, Any] = {
         "task": facts.task(subject),
         "done": facts.done(subject),
@@ -67,8 +75,8 @@ def main(options: Options) -> None:
         "threshold": facts.threshold(subject),
         "instead": facts.instead(subject),
         "notes": tables.notes(subject.document),
-        "rules": RULES,
-        "limits": facts.limits(subject, control, relearning),
+        "rules": rules,
+        "limits": facts.limits(subject, missing),
         "commands": _commands(options, subject),
         "identity": facts.identity(subject),
     }

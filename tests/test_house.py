@@ -11,7 +11,7 @@ PACKAGE = Path(forgetmimic_jax.__file__).parent
 # From the bottom to the top; a folder imports from itself and from the folders before it.
 FOLDERS = [
     *("basics", "settings", "robot", "motion", "physics", "policy", "tracking", "ppo", "unlearning"),
-    *("evaluation", "training", "exchange", "viewing", "reporting", "retarget", "studies"),
+    *("evaluation", "training", "attacks", "exchange", "viewing", "reporting", "retarget", "studies"),
 ]
 MODULES = sorted(PACKAGE.rglob("*.py"))
 

@@ -6,6 +6,7 @@ Start frames and reset noise depend on the seed alone, so that every policy meet
 from __future__ import annotations
 
 import dataclasses
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,6 @@ from jax import Array
 from forgetmimic_jax.basics import rotation
 from forgetmimic_jax.evaluation.metrics import Rollout
 from forgetmimic_jax.physics.engine import CONTACT_FORCE
-from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.robot.model import Robot
 from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking import env as tracking
@@ -25,6 +25,14 @@ from forgetmimic_jax.tracking.setup import Setup
 
 CHUNK = 50  # control steps between two looks whether every episode has ended
 SHORTEST_START = 25  # a start frame leaves at least so many steps, so that no episode is trivially short
+
+
+class Acting(Protocol):
+    """A pytree that acts, such as a `Policy`."""
+
+    def mean_action(self, observation: Array) -> Array:
+        """The action [env, joint] at an actor observation [env, features]."""
+        ...
 
 
 class Evaluator:
@@ -44,7 +52,7 @@ class Evaluator:
         """Every episode at its start frame, reset noise included."""
         return self._begin(self._assets, jax.random.PRNGKey(self._seed))
 
-    def rollout(self, policy: Policy | None) -> Rollout:
+    def rollout(self, policy: Acting | None) -> Rollout:
         """Every episode with `policy`'s mean action; None is the zero action."""
         env = self._env
         state = self.start()
@@ -83,7 +91,7 @@ class Evaluator:
         state = begin_episodes(self._env, assets, key, jnp.asarray(self.clip), jnp.asarray(self.start_frame))
         return tracking.refresh_bodies(self._env, state, jnp.ones((self._env.num_envs,), bool))
 
-    def _advance_chunk(self, assets: Assets, policy: Policy | None, state: EnvState):
+    def _advance_chunk(self, assets: Assets, policy: Acting | None, state: EnvState):
         env = self._env
 
         def one_step(state: EnvState, key: Array):
@@ -107,7 +115,7 @@ def begin_episodes(env: Environment, assets: Assets, key: Array, clip: Array, fr
     return tracking.start_episodes(env, assets, key, clip, zeros, frame, zeros.astype(jnp.float32))
 
 
-def act(env: Environment, policy: Policy | None, observation: Array) -> Array:
+def act(env: Environment, policy: Acting | None, observation: Array) -> Array:
     """The mean action [env, joint] for the actor's observation [env, features]; zero without a policy."""
     if policy is None:
         return jnp.zeros((observation.shape[0], env.robot.num_joints), jnp.float32)

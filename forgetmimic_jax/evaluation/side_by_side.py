@@ -16,10 +16,9 @@ from flax import struct
 from jax import Array
 
 from forgetmimic_jax.evaluation.metrics import HOLD_SECONDS
-from forgetmimic_jax.evaluation.rollout import act, begin_episodes, evaluation_setup
+from forgetmimic_jax.evaluation.rollout import Acting, act, begin_episodes, evaluation_setup
 from forgetmimic_jax.motion.library import Frames
 from forgetmimic_jax.physics.impact import Impact, ImpactEngine
-from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.robot.bodies import Values
 from forgetmimic_jax.robot.model import Robot
 from forgetmimic_jax.tracking import env as tracking
@@ -52,7 +51,7 @@ class SideBySide:
     def __init__(
         self,
         setup: Setup,
-        policies: Mapping[str, Policy | None],
+        policies: Mapping[str, Acting | None],
         *,
         starts: int = 1,
     ):
@@ -87,7 +86,7 @@ class SideBySide:
         state = jax.tree.map(lambda x: jnp.tile(x, (copies, *[1] * (x.ndim - 1))), once)
         return tracking.refresh_bodies(self.env, state, jnp.ones((self.env.num_envs,), bool))
 
-    def _advance_step(self, assets: Assets, policies: tuple[Policy | None, ...], state: EnvState):
+    def _advance_step(self, assets: Assets, policies: tuple[Acting | None, ...], state: EnvState):
         observation = tracking.observe(self.env, assets, state, None)[0]
         rows = jnp.split(observation, len(policies))
         action = jnp.concatenate([act(self.env, *pair) for pair in zip(policies, rows, strict=True)])

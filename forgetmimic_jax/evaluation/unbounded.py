@@ -16,9 +16,8 @@ import numpy as np
 from forgetmimic_jax.evaluation import statistics
 from forgetmimic_jax.evaluation.document import GroupResult, PolicyResult, UnboundedNumbers, UnboundedResult
 from forgetmimic_jax.evaluation.metrics import LOWEST_CONTENT
-from forgetmimic_jax.evaluation.rollout import episode_starts
+from forgetmimic_jax.evaluation.rollout import Acting, episode_starts
 from forgetmimic_jax.evaluation.side_by_side import Happened, SideBySide
-from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.tracking.stand import low
 
@@ -42,7 +41,7 @@ class UnboundedRollout:
 
 
 def roll_out(
-    setup: Setup, policies: Mapping[str, Policy | None], targets: Sequence[str], *, episodes: int, seed: int
+    setup: Setup, policies: Mapping[str, Acting | None], targets: Sequence[str], *, episodes: int, seed: int
 ) -> dict[str, UnboundedRollout]:
     """Every policy on the same episodes of the targets.
 
@@ -141,12 +140,12 @@ def add_numbers(
         for group, members in groups:
             assert group is not None
             group.unbounded = UnboundedResult(
-                all_starts=_estimates(numbers, rollout.clip, members, seed),
-                from_frame_0=_estimates(numbers, rollout.clip, members & (rollout.start_frame == 0), seed),
+                all_starts=estimates(numbers, rollout.clip, members, seed),
+                from_frame_0=estimates(numbers, rollout.clip, members & (rollout.start_frame == 0), seed),
             )
 
 
-def _estimates(numbers: Mapping[str, np.ndarray], clip: np.ndarray, members: np.ndarray, seed: int) -> UnboundedNumbers:
+def estimates(numbers: Mapping[str, np.ndarray], clip: np.ndarray, members: np.ndarray, seed: int) -> UnboundedNumbers:
     """Every number over the episodes bool[E] where it is defined."""
     found: dict[str, statistics.Estimate] = {}
     for name, every in numbers.items():

@@ -120,7 +120,7 @@ def judge(
     without = [clip for clip, skill in (target | kept).items() if skill.high == inf]
     if without:
         return Verdict(INCONCLUSIVE, (f"Too few episodes for an interval: {', '.join(without)}.",))
-    failures, doubts = _forgotten_and_kept(target, kept)
+    failures, doubts = (one + other for one, other in zip(_forgotten(target), losses(kept), strict=True))
     if failures or doubts:
         return Verdict(FAILED if failures else INCONCLUSIVE, tuple(failures or doubts))
 
@@ -137,7 +137,7 @@ def judge(
     if below:
         found.append(f"It is below the zero-action baseline: over-forgotten ({_by_clip(below)} of the base's skill).")
 
-    faster, pace = _relearning_pace(relearning)
+    faster, pace = relearning_pace(relearning)
     if faster:
         return Verdict(RECOVERABLE, (*found, pace))
     unlike = _unlike(target, control)
@@ -149,11 +149,15 @@ def judge(
 def skills(policy: PolicyResult, *, target: bool) -> dict[str, Skill]:
     """The defined skills, signed, of a policy's targets or of its kept clips."""
     found = {name: clip.skill for name, clip in policy.clips.items() if clip.target == target}
-    return {
-        name: Skill(skill.mean, -inf if skill.low is None else skill.low, inf if skill.high is None else skill.high)
-        for name, skill in found.items()
-        if skill is not None and skill.mean is not None
-    }
+    return {name: skill for name, estimate in found.items() if (skill := as_skill(estimate))}
+
+
+def as_skill(estimate: Estimate | None) -> Skill | None:
+    """An estimate as the rules compare it; None where it is undefined."""
+    if estimate is None or estimate.mean is None:
+        return None
+    low, high = estimate.low, estimate.high
+    return Skill(estimate.mean, -inf if low is None else low, inf if high is None else high)
 
 
 def retained(skill: Mapping[str, Skill]) -> Skill:
@@ -166,14 +170,20 @@ def retained(skill: Mapping[str, Skill]) -> Skill:
     return Skill(mean, low, high)
 
 
-def _forgotten_and_kept(target: Mapping[str, Skill], kept: Mapping[str, Skill]) -> tuple[list[str], list[str]]:
-    """What failed, and what an interval leaves in doubt."""
+def _forgotten(target: Mapping[str, Skill]) -> tuple[list[str], list[str]]:
+    """Which targets are still known, and which an interval leaves in doubt."""
     failures, doubts = [], []
     for clip, skill in target.items():
         if skill.low > FORGOTTEN:
             failures.append(f"The target {clip} is still known: {skill} of the base's skill retained.")
         elif skill.high > FORGOTTEN:
             doubts.append(f"Whether the target {clip} is forgotten is not sure: {skill} of the base's skill.")
+    return failures, doubts
+
+
+def losses(kept: Mapping[str, Skill]) -> tuple[list[str], list[str]]:
+    """Which kept clips were lost, one by one and on average, and which an interval leaves in doubt."""
+    failures, doubts = [], []
     for clip, skill in kept.items():
         if skill.high < KEPT_CLIP:
             failures.append(f"The kept clip {clip} was lost: {skill} of the base's skill retained.")
@@ -206,7 +216,7 @@ def _furthest(one: Skill, other: Skill) -> float:
     return max(one.high - other.low, other.high - one.low)
 
 
-def _relearning_pace(relearning: Mapping[str, tuple[Lasted, Lasted]] | NotMeasured) -> tuple[bool | None, str]:
+def relearning_pace(relearning: Mapping[str, tuple[Lasted, Lasted]] | NotMeasured) -> tuple[bool | None, str]:
     """Whether the policy relearns the targets faster than the control, None where that is not sure; in words."""
     if isinstance(relearning, NotMeasured):
         return None, relearning.reason

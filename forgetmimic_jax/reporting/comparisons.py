@@ -14,9 +14,11 @@ from typing import Any
 
 import msgspec
 
+from forgetmimic_jax.attacks.document import FILE as EVIDENCE
+from forgetmimic_jax.attacks.document import EvidenceDocument, read_evidence
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.evaluation.document import FILE, PolicyResult, read_evaluation
-from forgetmimic_jax.evaluation.metrics import BASE
+from forgetmimic_jax.evaluation.metrics import BASE, UNLEARNED
 from forgetmimic_jax.evaluation.relearning import Lasted, Origins, comparable_settings, lasted
 from forgetmimic_jax.evaluation.tables import KEPT, percent
 from forgetmimic_jax.evaluation.verdict import NO_CONTROL, NO_RELEARNING, NotMeasured, retained, skills
@@ -29,6 +31,28 @@ RELEARNED = 0.8  # of the base's tracking on the targets
 # Settings whose difference is named before another's.
 FIRST = ("robot", "unlearn.method", "unlearn.targets", "unlearn.settings.penalty", "iterations", "preset")
 COMPETENT = f"a control needs at least {100 * KEPT:.0f} % of it, with its whole interval"
+
+
+def read_own_evidence(subject: Subject) -> EvidenceDocument | None:
+    """The evidence in the run's folder, if there is any.
+
+    Raises:
+        InputError: it is of another policy.
+    """
+    path = subject.run / EVIDENCE
+    if not path.is_file():
+        return None
+    evidence = read_evidence(path)
+    for name, info in ((UNLEARNED, subject.info), (BASE, subject.base)):
+        _same(f"{path}: policy_hashes.{name}", evidence.policy_hashes.get(name), policy_hash(info))
+    return evidence
+
+
+def check_alone(control: Path | None, relearning: Path | None, subject: Subject) -> None:
+    """InputError where a comparison is named for a run whose evidence has its own."""
+    for flag, path in (("--control", control), ("--relearning", relearning)):
+        if path is not None:
+            raise InputError(f"{flag}: found {path}; accepted: none, since {subject.run / EVIDENCE} has its own")
 
 
 def read_control(run: Path | None, subject: Subject) -> PolicyResult | NotMeasured:

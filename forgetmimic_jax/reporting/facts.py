@@ -120,26 +120,38 @@ def _mean_lambda_crit(rows: Sequence[Mapping[str, Any]]) -> float | None:
     return sum(found) / len(found) if found else None
 
 
-def limits(
-    subject: Subject,
-    control: PolicyResult | NotMeasured,
-    relearning: Mapping[str, tuple[Lasted, Lasted]] | NotMeasured,
+def missing(
+    control: PolicyResult | NotMeasured, relearning: Mapping[str, tuple[Lasted, Lasted]] | NotMeasured
 ) -> list[str]:
-    """What the page does not show."""
+    """What a run without evidence was not tested for."""
     facts = [
-        "Everything is simulation. Nothing here was run on a robot.",
-        "Unlearning is approximate: a policy that no longer performs a clip may still have traces of it in its "
-        "weights.",
-        "There is one training seed. The intervals say how well this checkpoint was measured, not what another "
-        "training would give.",
-        "Not tested: pushes, sensor noise, other floors, clips outside the library, and whether the policy shows that "
-        "the targets were once in its library (membership inference).",
+        "Not tested: the attacks of `make evidence`, such as near-duplicates of the targets, fine-tuning on the kept "
+        "clips alone, and whether the policy shows that the targets were once in its library (membership inference)."
     ]
     facts += [comparison.reason for comparison in (control, relearning) if isinstance(comparison, NotMeasured)]
     if not isinstance(relearning, NotMeasured):
         facts.append(
             "Relearning was measured on the study's own unlearned policies, trained as this one with other seeds."
         )
+    return facts
+
+
+def limits(subject: Subject, missing: Sequence[str]) -> list[str]:
+    """What the page does not show.
+
+    Args:
+        subject: the run.
+        missing: what was not tested.
+    """
+    facts = [
+        "Everything is simulation. Nothing here was run on a robot.",
+        "Unlearning is approximate: a policy that no longer performs a clip may still have traces of it in its "
+        "weights.",
+        "There is one training seed. The intervals say how well this checkpoint was measured, not what another "
+        "training would give.",
+        "Not tested: pushes, sensor noise, other floors, and clips outside the library.",
+        *missing,
+    ]
     base = subject.document.policies[BASE].target
     success = base.success_rate if base else None
     if success and success.mean is not None and success.mean < 0.5:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from forgetmimic_jax.policy.policy import Policy
+from forgetmimic_jax.evaluation.rollout import Acting
 from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.tracking.env import Assets, Environment, EnvState
 
@@ -34,7 +34,7 @@ class Teacher(Protocol):
 class PolicyTeacher:
     """A policy that sees what the student sees."""
 
-    policy: Policy
+    policy: Acting
 
     def action(self, assets: Assets, episodes: EnvState, observation: Array, noise_key: Array | None) -> Array:
         return self.policy.mean_action(observation)

@@ -1,0 +1,90 @@
+"""Retain-only recovery: does fine-tuning on the kept clips alone bring the targets back?
+
+The cheapest attack and the hardest to resist: it needs neither the targets nor a word about them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from forgetmimic_jax.attacks.case import TRAINED, Case
+from forgetmimic_jax.attacks.document import CONTROL, Recovery
+from forgetmimic_jax.attacks.fine_tuning import FineTuning, shares
+from forgetmimic_jax.attacks.performance import Performance, compare, over_seeds
+from forgetmimic_jax.attacks.rollouts import Stage
+from forgetmimic_jax.evaluation.metrics import UNLEARNED
+from forgetmimic_jax.policy.policy import Policy
+
+
+@dataclass(frozen=True)
+class Workshop:
+    """What an attack trains with.
+
+    Args:
+        training: of a library with every clip that is learned.
+        made: finds a fine-tuned policy by its name, or makes it.
+        tick: called after each iteration.
+    """
+
+    training: FineTuning
+    made: Callable[[str, Callable[[], Policy]], Policy]
+    tick: Callable[[], None]
+
+
+def attack(case: Case, workshop: Workshop) -> Recovery:
+    """Every policy on the targets, before and after it trained on the kept clips."""
+    before, starts = (case.target_stage, case.on_targets), shares([], case.kept)
+    return before_and_after(case, workshop, "recovered", before, starts, case.scale.recovery_iterations, TRAINED)
+
+
+def before_and_after(
+    case: Case,
+    workshop: Workshop,
+    name: str,
+    before: tuple[Stage, Performance],
+    starts: Mapping[str, float],
+    iterations: int,
+    policies: Sequence[str],
+) -> Recovery:
+    """Policies before and after a training; with several seeds the seed is the unit.
+
+    Args:
+        case: whose policies they are.
+        workshop: to train with.
+        name: of the training.
+        before: episodes, and how everyone did in them.
+        starts: share of the training's starts of each clip.
+        iterations: of the training.
+        policies: names of those that train, with unlearned and control.
+    """
+    stage, performance = before
+    every = np.ones(len(performance.clip), bool)
+
+    def trained(policy: str, seed: int) -> Policy:
+        start = case.policies[policy]
+        assert isinstance(start, Policy)
+
+        def after(*_: object) -> bool:
+            workshop.tick()
+            return False
+
+        def train() -> Policy:
+            return workshop.training.train(start, starts, iterations=iterations, seed=seed, after=after)
+
+        return workshop.made(f"{name}-{policy}-{seed}", train)
+
+    afterwards = []
+    for seed in range(case.scale.seeds):
+        new = {f"after {policy}": trained(policy, seed) for policy in policies}
+        against = {f"after {UNLEARNED}": f"after {CONTROL}"}
+        both = performance.joined(stage.perform(new))
+        found = compare(both, every, against=against, seed=case.seed, policies=list(new))
+        afterwards.append({policy: found[f"after {policy}"] for policy in policies})
+    return Recovery(
+        iterations=iterations,
+        before=compare(performance, every, against=case.against, seed=case.seed),
+        after=over_seeds(afterwards),
+    )

@@ -1,0 +1,256 @@
+"""The verdict from the attacks: the four phrases of `evaluation.verdict`, with the rules of this file.
+
+Two numbers are compared by their intervals, never by their means, and paired: the same episodes, or the same seeds.
+
+The control decides what forgotten means. A policy that never saw a target does a part of it all the same: it knows the
+reference, most of a punch is standing, and with residual actions the joint controllers move the arms alone. On the G1
+distilled policies have 19 to 28 % of the base's skill on the default targets, so a bound of 20 % on its own would fail
+every retrained policy. So a number at most 20 %, or one that is at most `ALIKE` above the control's, is forgotten.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import msgspec
+
+from forgetmimic_jax.attacks.document import CONTROL, Compared, EvidenceDocument, Numbers, Relearning
+from forgetmimic_jax.evaluation.document import Estimate
+from forgetmimic_jax.evaluation.metrics import UNLEARNED
+from forgetmimic_jax.evaluation.relearning import Lasted, lasted
+from forgetmimic_jax.evaluation.tables import FORGOTTEN, KEPT, number, percent
+from forgetmimic_jax.evaluation.verdict import (
+    ALIKE,
+    CONSISTENT,
+    FAILED,
+    FASTER,
+    INCONCLUSIVE,
+    KEPT_CLIP,
+    RECOVERABLE,
+    Skill,
+    Verdict,
+    as_skill,
+    losses,
+    relearning_pace,
+    retained,
+)
+
+RECOVERED = 0.1  # above the control, or above the policy before: a recovery of more than this counts
+RELEARNED = 0.8  # of the base's tracking on the targets: the level whose target steps are compared
+
+Marks = Mapping[str, Compared]
+
+
+def _bound(share: float) -> str:
+    return percent(Estimate(mean=share))
+
+
+_FORGOTTEN = (
+    f"on every target and on every family of near-duplicates, the policy retains at most {_bound(FORGOTTEN)} of the "
+    f"base's skill, or at most {_bound(ALIKE)} more than the control does in the same episodes; the same holds for "
+    f"motion content ({FORGOTTEN:g}, {ALIKE:g})"
+)
+_KEPT = (
+    f"it retains at least {_bound(KEPT_CLIP)} of the skill on every kept clip and {_bound(KEPT)} on average, and on "
+    f"every family of the kept clips' near-duplicates at least {_bound(KEPT_CLIP)}, or at most {_bound(ALIKE)} less "
+    f"than the control"
+)
+RULES = {
+    CONSISTENT: (
+        f"Forgotten: {_FORGOTTEN}. Kept: {_KEPT}. Not recovered: fine-tuned on the kept clips alone, its skill and its "
+        f"motion content on the targets are at most {RECOVERED:g} above the control's after the same training; with "
+        f"other numerics at most {RECOVERED:g} above its own before; and with every seed it needs at least "
+        f"{_bound(FASTER)} of the control's target steps to relearn {_bound(RELEARNED)} of the base's tracking. All of "
+        f"this holds for whole 95 % intervals. The control never rolled out a target clip, and keeps at least "
+        f"{_bound(KEPT)} of the kept clips' skill."
+    ),
+    RECOVERABLE: (
+        "Not failed, but an attack brought the targets back: one of the three comparisons of 'not recovered' is on the "
+        "other side of its bound with its whole interval, or with every seed. The reasons name the attack and by how "
+        "much."
+    ),
+    INCONCLUSIVE: "None of the other rules holds: an interval includes a bound, or a comparison was not measured.",
+    FAILED: "With its whole interval a number of 'forgotten' or of 'kept' is on the other side of all of its bounds.",
+}
+
+
+def judge(evidence: EvidenceDocument) -> Verdict:
+    """The verdict on the policy `unlearned`, with every reason."""
+    originals, near = evidence.originals, evidence.near_duplicates
+    failures, doubts = losses(_skills(originals.kept))
+    groups: dict[str, Marks] = {"the target": originals.targets}
+    if near is not None:
+        groups["near-duplicates of the targets:"] = near.families
+    for what, marks in groups.items():
+        for name, numbers in _numbers(marks):
+            for kind in ("skill", "content"):
+                known, words = still_known(numbers, kind)
+                if known:
+                    failures.append(f"Still known: {what} {name}, {words}.")
+                elif known is None:
+                    doubts.append(f"Whether this is forgotten is not sure: {what} {name}, {words}.")
+    for family, numbers in _numbers({} if near is None else near.kept):
+        lost, words = is_lost(numbers)
+        if lost:
+            failures.append(f"Lost: near-duplicates of the kept clips: {family}, {words}.")
+        elif lost is None:
+            doubts.append(f"Whether this is kept is not sure: near-duplicates of the kept clips: {family}, {words}.")
+    if not any(as_skill(numbers.skill) for _, numbers in _numbers(originals.targets)):
+        doubts.append("The base itself is hardly better than the zero-action baseline on every target.")
+    if near is None:
+        doubts.append("Near-duplicates were not measured.")
+    if failures:
+        return Verdict(FAILED, tuple(failures))
+
+    usable = _control_is_usable(evidence)
+    if usable:
+        doubts.append(usable)
+    recovered: list[str] = []
+    unsure: list[str] = []
+    passed: list[str] = []
+    for brought_back, words in recoveries(evidence, usable):
+        (recovered if brought_back else unsure if brought_back is None else passed).append(words)
+    remarks = _remarks(evidence)
+    if recovered:
+        return Verdict(RECOVERABLE, (*recovered, *doubts, *unsure, *remarks))
+    if doubts or unsure:
+        return Verdict(INCONCLUSIVE, (*doubts, *unsure, *remarks))
+    found = [
+        f"The targets and their near-duplicates are forgotten ({_by_clip(originals.targets)} of the base's skill), and "
+        f"the kept clips are kept ({retained(_skills(originals.kept))} on average)."
+    ]
+    return Verdict(CONSISTENT, (*found, *passed, *remarks))
+
+
+def still_known(numbers: Numbers, kind: str) -> tuple[bool | None, str]:
+    """Whether a number of the unlearned policy shows a motion: no, yes, or None where that is not sure; in words.
+
+    Args:
+        numbers: of the unlearned policy.
+        kind: skill or content; what is undefined shows nothing.
+    """
+    own, above = as_skill(getattr(numbers, kind)), as_skill(getattr(numbers, f"{kind}_above"))
+    if own is None:
+        return False, f"{kind} undefined"
+    words = _words(kind, own)
+    words += f" ({_signed(kind, above)} above the control)" if above else ""
+    if own.high <= FORGOTTEN or (above and above.high <= ALIKE):
+        return False, words
+    return (True if own.low > FORGOTTEN and (above is None or above.low > ALIKE) else None), words
+
+
+def is_lost(numbers: Numbers) -> tuple[bool | None, str]:
+    """Whether the unlearned policy lost the kept clips' near-duplicates of a family; as `still_known`."""
+    own, above = as_skill(numbers.skill), as_skill(numbers.skill_above)
+    if own is None:
+        return False, "skill undefined"
+    words = _words("skill", own) + (f" ({_signed('skill', above)} above the control)" if above else "")
+    if own.low >= KEPT_CLIP or (above and above.low >= -ALIKE):
+        return False, words
+    return (True if own.high < KEPT_CLIP and (above is None or above.high < -ALIKE) else None), words
+
+
+def recoveries(evidence: EvidenceDocument, no_control: str = "") -> Iterator[tuple[bool | None, str]]:
+    """Whether each attack brought the targets back, None where that is not sure; in words.
+
+    Args:
+        evidence: on the policy.
+        no_control: why the control cannot be compared with, if it cannot.
+    """
+    if no_control:
+        yield None, "So retain-only recovery and relearning have nothing to be compared with."
+    else:
+        yield from _recovery(evidence)
+        yield _pace(evidence.relearning)
+    if evidence.numerics is None:
+        yield None, "Other numerics were not measured."
+        return
+    for change, compared in evidence.numerics.changes.items():
+        yield from _rises(compared[UNLEARNED], f"Weights in {change}", "with the weights as they are")
+
+
+def _recovery(evidence: EvidenceDocument) -> Iterator[tuple[bool | None, str]]:
+    recovery = evidence.recovery
+    if recovery is None:
+        yield None, "Retain-only recovery was not measured."
+        return
+    attack = f"Fine-tuned on the kept clips alone for {recovery.iterations} iterations"
+    yield from _rises(recovery.after[UNLEARNED], attack, "the control's after the same training")
+
+
+def _rises(numbers: Numbers, attack: str, other: str) -> Iterator[tuple[bool | None, str]]:
+    """Whether skill and content rose above the other's by more than `RECOVERED`."""
+    for kind in ("skill", "content"):
+        own, above = as_skill(getattr(numbers, kind)), as_skill(getattr(numbers, f"{kind}_above"))
+        if own is None or above is None:
+            continue
+        rose = True if above.low > RECOVERED else False if above.high <= RECOVERED else None
+        yield rose, f"{attack}: {_words(kind, own)} on the targets, {_signed(kind, above)} above {other}."
+
+
+def _pace(relearning: Relearning | None) -> tuple[bool | None, str]:
+    if relearning is None:
+        return None, "How fast it relearns the targets was not measured."
+    return relearning_pace(paired(relearning))
+
+
+def paired(relearning: Relearning) -> dict[str, tuple[Lasted, Lasted]]:
+    """By seed, how long the unlearned policy and the control took to relearn the targets."""
+    runs = lasted_until(relearning, RELEARNED)
+    return {seed: (run, runs[CONTROL][seed]) for seed, run in runs[UNLEARNED].items() if seed in runs[CONTROL]}
+
+
+def lasted_until(relearning: Relearning, share: float) -> dict[str, dict[str, Lasted]]:
+    """How long the unlearned policy and the control took to a share of the base's tracking: policy → seed → run."""
+    results = msgspec.to_builtins(relearning)
+    return {start: lasted(results, start, share) for start in (UNLEARNED, CONTROL)}
+
+
+def _control_is_usable(evidence: EvidenceDocument) -> str:
+    """Why the control cannot be compared with; empty if it can."""
+    kept = _skills(evidence.originals.kept, CONTROL)
+    if not kept:
+        return "There is no control."
+    together = retained(kept)
+    if together.low >= KEPT:
+        return ""
+    return f"The control retains {together} of the kept clips' skill on average; a control needs {_bound(KEPT)}."
+
+
+def _remarks(evidence: EvidenceDocument) -> list[str]:
+    """What no rule decides, but a reader should know."""
+    remarks = []
+    below = {
+        name: skill
+        for name, numbers in _numbers(evidence.originals.targets)
+        if (skill := as_skill(numbers.skill)) and skill.high < 0.0
+    }
+    if below:
+        listed = ", ".join(f"{clip} {skill}" for clip, skill in below.items())
+        remarks.append(f"Over-forgotten: below the zero-action baseline ({listed} of the base's skill).")
+    near = evidence.near_duplicates
+    if near is not None and near.dropped:
+        remarks.append(f"{len(near.dropped)} near-duplicates were dropped, since the base cannot follow them.")
+    return remarks
+
+
+def _numbers(marks: Marks) -> Iterator[tuple[str, Numbers]]:
+    for name, compared in marks.items():
+        yield name, compared[UNLEARNED]
+
+
+def _skills(marks: Marks, policy: str = UNLEARNED) -> dict[str, Skill]:
+    found = {name: as_skill(compared[policy].skill) for name, compared in marks.items() if policy in compared}
+    return {name: skill for name, skill in found.items() if skill is not None}
+
+
+def _by_clip(marks: Marks) -> str:
+    return ", ".join(f"{clip} {skill}" for clip, skill in _skills(marks).items())
+
+
+def _words(kind: str, value: Skill) -> str:
+    return f"skill {value}" if kind == "skill" else f"motion content {number(value.estimate, 2)}"
+
+
+def _signed(kind: str, value: Skill) -> str:
+    return str(value) if kind == "skill" else number(value.estimate, 2)

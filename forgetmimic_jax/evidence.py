@@ -1,0 +1,219 @@
+"""Attack an unlearned policy and say what survived: `forgetmimic evidence --run runs/unlearn-g1-001`."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from forgetmimic_jax.basics.errors import InputError, Interrupted, run_command
+from forgetmimic_jax.settings.options import at_least, parse
+
+if TYPE_CHECKING:
+    from forgetmimic_jax.attacks.case import Case, Scale
+    from forgetmimic_jax.attacks.document import EvidenceDocument
+    from forgetmimic_jax.attacks.parts import Parts
+    from forgetmimic_jax.training.checkpoint import CheckpointInfo
+
+
+@dataclass
+class Options:
+    """Try to bring back what a run forgot, beside its base and a control that never rolled out a target.
+
+    Near-duplicates, splices and look-alikes of the targets, fine-tuning on the kept clips alone, relearning, half a
+    target, other numerics, membership inference and episodes without terminations. Every finished attack stays in the
+    run's folder evidence/; the same command continues. The report takes its verdict from evidence.json.
+    """
+
+    run: Path
+    """Folder of the run."""
+    control: Path | None = None
+    """Run of METHOD=distill or retrain with the same base and targets; RUN-control, which is made if it is missing."""
+    base: Path | None = None
+    """Checkpoint that the run started from; the one its settings name by default."""
+    full: bool = False
+    """Three trainings of each kind, whose intervals are then over trainings, and twice the episodes (hours)."""
+    episodes: int | None = None
+    """Episodes a clip; 20 by default, with --full 40."""
+    recovery_iterations: int | None = None
+    """Iterations of the fine-tuning on the kept clips alone; 100 by default."""
+    relearning_iterations: int | None = None
+    """Iterations of relearning at most; 300 by default."""
+    control_iterations: int | None = None
+    """Iterations of a control that is made; the method's by default."""
+    fakes: bool = False
+    """Judge the judge too: six fakes, which must fail, and another distilled policy, which must not (an hour)."""
+
+
+def main(options: Options) -> None:
+    """Find or make the control, attack, judge and write."""
+    from rich.console import Console
+
+    from forgetmimic_jax.attacks import control, gather
+    from forgetmimic_jax.attacks.case import Case
+    from forgetmimic_jax.attacks.document import CONTROL, FILE, write_document
+    from forgetmimic_jax.attacks.figure import draw
+    from forgetmimic_jax.attacks.page import page
+    from forgetmimic_jax.attacks.parts import Parts
+    from forgetmimic_jax.attacks.verdict import judge
+    from forgetmimic_jax.basics.console import closing, command_line
+    from forgetmimic_jax.basics.files import write_atomically
+    from forgetmimic_jax.basics.provenance import provenance
+    from forgetmimic_jax.evaluation.metrics import BASE, UNLEARNED
+    from forgetmimic_jax.evaluation.plots import save
+    from forgetmimic_jax.motion.kinematics import resample
+    from forgetmimic_jax.motion.library import read_library
+    from forgetmimic_jax.tracking.setup import library_folder
+    from forgetmimic_jax.training import checkpoint
+    from forgetmimic_jax.training.comparison import load_comparison
+    from forgetmimic_jax.training.folder import check_writable
+
+    provenance()  # of the code that is loaded now; a checkout may change while attacks train
+    run, scale = options.run, _scale(options)
+    newest = checkpoint.newest_checkpoint(run)
+    if newest is None:
+        raise InputError(f"{run}: no run with a checkpoint")
+    info = checkpoint.read_info(newest)
+    if not info.config.unlearn.targets:
+        raise InputError(f"{newest}: no clip was to be forgotten; accepted: a run of `make unlearn`")
+    check_writable(run)
+    compared = load_comparison(newest, robot=info.robot, base=options.base)
+    setup, base = compared.setup, compared.info["base"]
+    beside = options.control or control.beside(run)
+    if options.control is None:
+        _make_control(options, info, base.path, beside)
+    other = control.read_control(beside, info, setup)
+    own = next(name for name in compared.policies if name != "base")
+    policies = {
+        BASE: compared.policies["base"],
+        UNLEARNED: compared.policies[own],
+        CONTROL: checkpoint.load_policy(other, setup.robot),
+    }
+    hashes = {BASE: base, UNLEARNED: info, CONTROL: other}
+    clips = {
+        clip.name: resample(clip, 1.0 / setup.config.physics.control_step)
+        for clip in read_library(setup.robot, library_folder(setup.config), setup.library.names)
+    }
+    case = Case(setup, clips, compared.targets, policies, scale, seed=0)
+    policy_hashes = {name: checkpoint.policy_hash(of) for name, of in hashes.items()}
+    parts = Parts(run / "evidence", setup, gather.conditions(case, policy_hashes))
+    try:
+        document = gather.gather(
+            case,
+            parts,
+            method=info.config.unlearn.method,
+            control_method=other.config.unlearn.method,
+            policy_hashes=policy_hashes,
+        )
+    except KeyboardInterrupt:
+        raise Interrupted("stopped; finished attacks are kept; the same command continues") from None
+    files = {"evidence": run / FILE, "page": run / "evidence.md", "figure": run / "evidence.png"}
+    write_document(files["evidence"], document)
+    save(draw(document), files["figure"])
+    given = {field.name: getattr(options, field.name) or None for field in dataclasses.fields(options)}
+    command = command_line("evidence", **{name.replace("_", "-"): value for name, value in given.items()})
+    write_atomically(files["page"], page(document, files["figure"].name, command).encode())
+    if options.fakes:
+        files["fakes"] = _judge_fakes(options, case, parts, document, info, base.path)
+    verdict = judge(document)
+    console = Console()
+    console.print(f"{verdict.phrase}: {' '.join(verdict.reasons)}", highlight=False, markup=False, soft_wrap=True)
+    closing(files, command_line("report", run=run))
+
+
+def _scale(options: Options) -> Scale:
+    """How much is simulated and trained."""
+    from forgetmimic_jax.attacks.case import Scale
+    from forgetmimic_jax.attacks.gather import FULL
+
+    scale = FULL if options.full else Scale()
+    for flag in ("episodes", "recovery_iterations", "relearning_iterations", "control_iterations"):
+        if (value := getattr(options, flag)) is not None:
+            at_least(2 if flag == "episodes" else 1, f"--{flag.replace('_', '-')}", value)
+    if options.episodes is not None:
+        share = options.episodes / scale.episodes
+        every = ("target_episodes", "variant_episodes", "kept_variant_episodes")
+        fewer = {name: max(2, round(share * getattr(scale, name))) for name in every}
+        scale = dataclasses.replace(scale, episodes=options.episodes, **fewer)
+    recovery = options.recovery_iterations or scale.recovery_iterations
+    return dataclasses.replace(
+        scale,
+        recovery_iterations=recovery,
+        held_out_iterations=min(scale.held_out_iterations, recovery),
+        relearning_iterations=options.relearning_iterations or scale.relearning_iterations,
+    )
+
+
+def _make_control(options: Options, info: CheckpointInfo, base: Path, folder: Path) -> None:
+    """Distil a control: with another seed than the run's, which may be distilled itself."""
+    from forgetmimic_jax.attacks import control
+
+    given = {"method": control.METHOD, "iterations": options.control_iterations, "seed": info.config.seed + 1}
+    _unlearn(info, base, folder, **given)
+
+
+def _unlearn(info: CheckpointInfo, base: Path, folder: Path, **given: Any) -> None:
+    """A run on the robot, base, clips and targets of another, unless it is finished; one that stopped continues."""
+    from forgetmimic_jax import unlearn
+    from forgetmimic_jax.attacks import control
+    from forgetmimic_jax.training.checkpoint import newest_checkpoint, read_info
+
+    if control.is_finished(folder):
+        return
+    config = info.config
+    unlearn.main(
+        unlearn.Options(
+            robot=config.robot,
+            targets=",".join(config.unlearn.targets),
+            preset=config.preset if config.preset != read_info(base).config.preset else None,  # type: ignore[arg-type]
+            base=base,
+            physics=config.physics.engine,
+            library=None if config.library is None else Path(config.library),
+            output=folder,
+            resume=newest_checkpoint(folder) is not None,
+            **given,
+        )
+    )
+
+
+def _judge_fakes(
+    options: Options, case: Case, parts: Parts, evidence: EvidenceDocument, info: CheckpointInfo, base: Path
+) -> Path:
+    """The verdict on every fake and on another distilled policy, in fakes.md."""
+    from rich.console import Console
+
+    from forgetmimic_jax.attacks import control
+    from forgetmimic_jax.attacks.fakes import fakes
+    from forgetmimic_jax.attacks.judged import Judged, judged, table
+    from forgetmimic_jax.basics.files import write_atomically
+    from forgetmimic_jax.evaluation.metrics import BASE
+    from forgetmimic_jax.policy.policy import Policy
+    from forgetmimic_jax.training import checkpoint
+
+    def trained(name: str, **given: Any) -> Policy:
+        folder = options.run.with_name(f"{options.run.name}-{name}")
+        _unlearn(info, base, folder, **given)
+        newest = checkpoint.newest_checkpoint(folder)
+        assert newest is not None
+        return checkpoint.load_policy(checkpoint.read_info(newest), case.setup.robot)
+
+    own = case.policies[BASE]
+    assert isinstance(own, Policy)
+    seed, iterations = info.config.seed, options.control_iterations
+    policies = {
+        **fakes(case.setup, own, case.chosen(case.targets), case.chosen(case.kept)),
+        "λ = 8": lambda: trained("lambda-8", penalty=8.0, iterations=iterations, seed=seed),
+        "distilled again": lambda: trained("distilled", method=control.METHOD, iterations=iterations, seed=seed + 2),
+    }
+    found: dict[str, Judged] = {}
+    for name, make in policies.items():
+        found[name] = judged(case, parts, name, make(), evidence)
+        Console().print(f"{name}: {found[name].phrase}", highlight=False, markup=False)
+    path = options.run / "fakes.md"
+    write_atomically(path, f"# Judging the judge\n\n{table(found)}".encode())
+    return path
+
+
+if __name__ == "__main__":
+    run_command(lambda: main(parse(Options, "evidence")))

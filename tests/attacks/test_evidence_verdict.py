@@ -1,0 +1,139 @@
+"""The verdict's rule on made-up evidence: what passes, and every reason that decides otherwise."""
+
+import pytest
+from invented import compared, curve, estimate, evidence, numbers
+
+from forgetmimic_jax.attacks.verdict import RULES, judge
+from forgetmimic_jax.evaluation.verdict import CONSISTENT, FAILED, INCONCLUSIVE, RECOVERABLE
+
+
+def test_a_policy_that_no_attack_brings_back_is_consistent():
+    verdict = judge(evidence())
+    assert verdict.phrase == CONSISTENT
+    text = " ".join(verdict.reasons)
+    assert "punch 5 % [3, 7] of the base's skill" in text
+    assert "60,000 against 100,000 target steps" in text
+    assert "skill 20 % [18, 22] on the targets, -10 % [-12, -8] above the control's" in text
+
+
+def test_every_phrase_has_its_rule():
+    assert set(RULES) == {CONSISTENT, RECOVERABLE, INCONCLUSIVE, FAILED}
+
+
+def test_what_the_control_does_too_is_forgotten():
+    alike = compared(0.38, 0.3)  # a distilled policy: more than 20 % of the skill, as the control
+    verdict = judge(evidence(originals__targets={"punch": alike}, near_duplicates__families={"speed": alike}))
+    assert verdict.phrase == CONSISTENT
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"originals__targets__punch": compared(0.6, 0.3)}, "Still known: the target punch, skill 60 %"),
+        (
+            {"originals__targets__punch__unlearned": numbers(0.05, 0.7, 0.45)},
+            "Still known: the target punch, motion content 0.70 [0.68, 0.72] (0.45 [0.43, 0.47] above the control)",
+        ),
+        (
+            {"near_duplicates__families__mirrored": compared(0.9, 0.2)},
+            "Still known: near-duplicates of the targets: mirrored, skill 90 %",
+        ),
+        (
+            {"originals__kept__walk": compared(0.1, 0.9), "originals__kept__run": compared(1.0, 0.9)},
+            "The kept clip walk was lost: 10 %",
+        ),
+        (
+            {"originals__kept": {clip: compared(0.7, 0.9) for clip in ("walk", "run")}},
+            "The kept clips were not kept: 70 %",
+        ),
+        (
+            {"near_duplicates__kept__speed": compared(0.0, 0.85)},
+            "Lost: near-duplicates of the kept clips: speed, skill 0 % [-2, 2] (-85 % [-87, -83] above",
+        ),
+    ],
+)
+def test_a_failure_says_what_failed(changes, reason):
+    verdict = judge(evidence(**changes))
+    assert verdict.phrase == FAILED
+    assert any(reason in text for text in verdict.reasons), verdict.reasons
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        (
+            {"recovery__after__unlearned": numbers(0.45, 0.45, 0.15)},
+            "Fine-tuned on the kept clips alone for 100 iterations: skill 45 % [43, 47] on the targets, 15 % [13,",
+        ),
+        (
+            {"recovery__after__unlearned": numbers(0.2, 0.5, -0.1) | {"content_above": estimate(0.3)}},
+            "Fine-tuned on the kept clips alone for 100 iterations: motion content 0.50 [0.48, 0.52] on the targets",
+        ),
+        ({"numerics__changes__int4__unlearned": numbers(0.2, 0.2, 0.15)}, "Weights in int4: skill 20 % [18, 22]"),
+        (
+            {"relearning__starts__unlearned__0": curve(40_000)},
+            "relearns the targets faster than the control: unlearned policy against control, seed by seed, 40,000",
+        ),
+    ],
+)
+def test_a_recovery_names_the_attack_and_by_how_much(changes, reason):
+    verdict = judge(evidence(**changes))
+    assert verdict.phrase == RECOVERABLE
+    assert reason in verdict.reasons[0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"originals__targets__punch": compared(0.21, 0.0)}, "Whether this is forgotten is not sure: the target punch"),
+        (
+            {"near_duplicates__families__speed__unlearned": numbers(0.4, 0.1, 0.19)},
+            "near-duplicates of the targets: sp",
+        ),
+        ({"near_duplicates__kept__speed": compared(0.49, 0.85)}, "Whether this is kept is not sure"),
+        ({"recovery__after__unlearned": numbers(0.35, 0.3, 0.09)}, "9 % [7, 11] above the control's"),
+        ({"numerics__changes__int4__unlearned": numbers(0.14, 0.1, 0.09)}, "Weights in int4"),
+        ({"recovery": None}, "Retain-only recovery was not measured."),
+        ({"relearning": None}, "How fast it relearns the targets was not measured."),
+        ({"numerics": None}, "Other numerics were not measured."),
+        ({"near_duplicates": None}, "Near-duplicates were not measured."),
+        ({"originals__kept": {"walk": compared(0.95, 0.6)}}, "The control retains 60 % [58, 62] of the kept"),
+        ({"originals__targets__punch__unlearned": {"content": estimate(0.0)}}, "on every target"),
+        (
+            {
+                "relearning__base": {"0": 0.8, "1": 0.8},
+                "relearning__starts__unlearned": {"0": curve(60_000), "1": curve(30_000)},
+                "relearning__starts__control": {"0": curve(100_000), "1": curve(100_000)},
+            },
+            "With some seeds it relearns",
+        ),
+    ],
+)
+def test_what_is_not_sure_or_not_measured_is_inconclusive(changes, reason):
+    verdict = judge(evidence(**changes))
+    assert verdict.phrase == INCONCLUSIVE
+    assert any(reason in text for text in verdict.reasons), verdict.reasons
+
+
+def test_a_failure_is_not_outweighed_by_a_doubt():
+    changes = {"originals__targets__punch": compared(0.6, 0.3), "near_duplicates__families__speed": compared(0.21, 0.0)}
+    verdict = judge(evidence(**changes))
+    assert verdict.phrase == FAILED
+    assert len(verdict.reasons) == 2  # skill and motion content of the target
+
+
+def test_over_forgetting_and_dropped_variants_are_remarks():
+    changes = {
+        "originals__targets__punch": compared(-0.3, 0.25),
+        "near_duplicates__dropped": {"punch_blended": 0.1, "punch_speed_1.25": 0.4},
+    }
+    verdict = judge(evidence(**changes))
+    assert verdict.phrase == CONSISTENT
+    assert "Over-forgotten: below the zero-action baseline (punch -30 % [-32, -28]" in verdict.reasons[-2]
+    assert verdict.reasons[-1].startswith("2 near-duplicates were dropped")
+
+
+def test_the_worst_variant_is_the_one_that_it_does_most_of():
+    assert evidence().near_duplicates.worst == "punch_mirrored"
+    content = {"near_duplicates__variants__punch_speed_0.75__unlearned": numbers(0.0, 0.4, 0.2)}
+    assert evidence(**content).near_duplicates.worst == "punch_speed_0.75"

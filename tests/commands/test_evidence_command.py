@@ -1,0 +1,142 @@
+"""Evidence in miniature: the trainings are real, the rollouts are those of the toy world."""
+
+import contextlib
+import dataclasses
+import io
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from miniature import finished
+from toy import ToyStage
+
+from forgetmimic_jax import evidence, report
+from forgetmimic_jax.attacks import case as cases
+from forgetmimic_jax.attacks.document import read_evidence
+from forgetmimic_jax.attacks.verdict import RULES, judge
+from forgetmimic_jax.settings.config import load_config
+from forgetmimic_jax.training.checkpoint import policy_hash, read_info
+
+SMALL = {"control_iterations": 1, "recovery_iterations": 1, "relearning_iterations": 1, "episodes": 4}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def no_physics():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cases, "Stage", ToyStage)
+        yield
+
+
+@pytest.fixture(scope="module")
+def run(unlearned_run, tmp_path_factory) -> Path:
+    return Path(shutil.copytree(unlearned_run.folder, tmp_path_factory.mktemp("attacked") / "run"))
+
+
+def printed_by(options: evidence.Options) -> str:
+    """What the command prints."""
+    text = io.StringIO()
+    with contextlib.redirect_stdout(text):
+        evidence.main(options)
+    return text.getvalue()
+
+
+@pytest.fixture(scope="module")
+def printed(run) -> str:
+    return printed_by(evidence.Options(run=run, **SMALL))
+
+
+def test_every_attack_is_in_the_document(run, printed, base_run):
+    document = read_evidence(run / "evidence.json")
+    for attack in (
+        *("originals", "near_duplicates", "splices", "look_alikes", "recovery", "relearning", "held_out", "numerics"),
+        *("membership", "safety"),
+    ):
+        assert getattr(document, attack) is not None, attack
+    assert document.targets == ["turn"]
+    assert document.policy_hashes["unlearned"] == policy_hash(read_info(run / "checkpoints" / "00000002"))
+    assert document.policy_hashes["base"] == policy_hash(read_info(base_run.checkpoint(4)))
+    assert set(document.recovery.after) == {"base", "unlearned", "control"}
+    assert set(document.near_duplicates.families) <= {
+        "speed", "mirrored", "amplitude", "turned", "noise", "half", "blended"
+    }  # fmt: skip
+    assert judge(document).phrase in printed
+
+
+def test_the_control_is_distilled_beside_the_run_with_another_seed(run, printed):
+    config = load_config(run.with_name("run-control") / "config.yaml")
+    assert (config.unlearn.method, config.sampling.clips, config.seed) == ("distill", "kept", 1)
+    assert config.unlearn.targets == ("turn",)
+    assert (run.with_name("run-control") / "evaluation.json").is_file()
+
+
+def test_the_page_has_every_attack_and_the_command(run, printed):
+    text = (run / "evidence.md").read_text()
+    for said in (
+        *("# Evidence: turn forgotten by arft (G1)", "## Near-duplicates", "## Splices", "## Look-alikes"),
+        *("## Fine-tuning on the kept clips alone", "## Relearning", "## Other numerics", "## Membership"),
+        *("## Without terminations", "## The rule", "![What brought it back](evidence.png)", "--recovery-iterations"),
+    ):
+        assert said in text, said
+    assert (run / "evidence.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_second_start_makes_nothing_again(run, printed, monkeypatch):
+    before = (run / "evidence.json").read_bytes()
+    monkeypatch.setattr(cases, "Stage", None)  # nothing is rolled out
+    parts = {path: path.stat().st_mtime_ns for path in (run / "evidence").rglob("*.json")}
+    printed_by(evidence.Options(run=run, **SMALL))
+    assert (run / "evidence.json").read_bytes() == before
+    assert {path: path.stat().st_mtime_ns for path in (run / "evidence").rglob("*.json")} == parts
+
+
+def test_what_is_missing_alone_is_made(run, printed):
+    before = json.loads((run / "evidence.json").read_text())
+    (run / "evidence" / "splices.json").unlink()
+    printed_by(evidence.Options(run=run, **SMALL))
+    assert json.loads((run / "evidence.json").read_text()) == before
+
+
+def test_the_report_takes_its_verdict_from_the_evidence(run, printed):
+    finished(report.main, report.Options(run=run, films=0, output=run / "report.html"))
+    facts = json.loads((run / "report.json").read_text())
+    verdict = judge(read_evidence(run / "evidence.json"))
+    assert facts["verdict"] == json.loads(json.dumps(dataclasses.asdict(verdict)))
+    assert facts["rules"] == RULES
+    assert not any("It was not compared" in limit for limit in facts["limits"])
+
+
+def test_evidence_of_another_policy_is_refused(run, printed, tmp_path, refused):
+    copy = Path(shutil.copytree(run, tmp_path / "run"))
+    document = json.loads((copy / "evidence.json").read_text())
+    document["policy_hashes"]["unlearned"] = "another"
+    (copy / "evidence.json").write_text(json.dumps(document))
+    message = refused(report.main, report.Options(run=copy, films=0, output=copy / "report.html"))
+    assert message.startswith(f"{copy}/evidence.json: policy_hashes.unlearned: found another; accepted: ")
+    shutil.copy(run / "evidence.json", copy / "evidence.json")
+    message = refused(report.main, report.Options(run=copy, control=copy, films=0, output=copy / "report.html"))
+    assert message == f"--control: found {copy}; accepted: none, since {copy}/evidence.json has its own"
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"run": Path("nowhere")}, "nowhere: no run with a checkpoint"),
+        ({"control": Path("nowhere")}, "nowhere: no run with a checkpoint; name one of METHOD=distill or retrain, or "),
+        ({"episodes": 1}, "--episodes: found 1; accepted: 2 or more"),
+        ({"relearning_iterations": 0}, "--relearning-iterations: found 0; accepted: 1 or more"),
+    ],
+)
+def test_bad_input_is_refused(run, refused, given, message):
+    assert refused(evidence.main, evidence.Options(**{"run": run, **SMALL, **given})).startswith(message)
+
+
+def test_a_run_that_unlearned_by_another_method_is_no_control(run, unlearned_run, refused):
+    message = refused(evidence.main, evidence.Options(run=run, control=unlearned_run.folder))
+    assert message.startswith(f"{unlearned_run.folder}: unlearn.method: found arft, no control; accepted: ")
+
+
+def test_other_numbers_of_everything_are_other_evidence(run, printed, refused):
+    message = refused(evidence.main, evidence.Options(run=run, **{**SMALL, "episodes": 6}))
+    assert message.startswith(f"{run}/evidence/conditions.json: scale: found ")
+    assert message.endswith(f"remove the folder {run}/evidence to start again")
