@@ -11,6 +11,7 @@
 ## LIBRARY      folder of clips (default: data/ROBOT)
 ## BASE         the policy to start from (default: the shipped one; for pretrain and train, none)
 ## CHECKPOINT   the policy to evaluate, export, play or film (default: the shipped base)
+## BESIDE       more checkpoints to play or film beside it, comma-separated
 ## RUN          folder of the run to attack, or to report on
 ## OUTPUT       where the results go (default: under runs/)
 ## RESUME       1 continues the run in OUTPUT

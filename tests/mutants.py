@@ -475,7 +475,7 @@ MUTANTS = (
     Mutant("lying_start", "forgetmimic_jax/evaluation/unbounded.py", "tests/evaluation/test_unbounded.py",
            "A robot that starts lying counts as one that fell.",
            "stood = ~rollout.lying_at_start",
-           "stood = rollout.lying_at_start | True"),
+           "stood = rollout.lying_at_start == rollout.lying_at_start"),
     Mutant("fall_time", "forgetmimic_jax/evaluation/unbounded.py", "tests/evaluation/test_unbounded.py",
            "A fall is seen a control step before it happens.",
            "falls.argmax(axis=1) + 1)",
