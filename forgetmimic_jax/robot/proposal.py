@@ -16,7 +16,7 @@ import numpy as np
 
 from forgetmimic_jax.robot.standing import soles, standing
 from forgetmimic_jax.robot.tree import Tree
-from forgetmimic_jax.robot.vendor import Additions, Unreadable, read_mjcf
+from forgetmimic_jax.robot.vendor import Additions, Unreadable, read_mjcf, sphere_name
 
 KNEE, ELBOW = ("knee", "shin", "calf", "lower_leg"), ("elbow", "forearm", "lower_arm")
 HAND, FOOT = ("hand", "wrist", "palm", "gripper"), ("foot", "ankle", "sole")
@@ -24,6 +24,7 @@ ARMATURE_PER_TORQUE = 1.8e-4  # kg m^2 per N m: Unitree's G1 and H2 motors lie b
 STANDING = ("home", "stand", "standing", "default", "init", "knees_bent")  # a vendor's names of keyframes
 UPRIGHT = 0.99  # w of the root's quaternion
 ALIKE = 0.1  # of the robot's height
+BALL = 0.05  # m, radius of what stands for a body without a shape
 SPEED = 20.0  # rad/s, a motor's, which no MJCF says
 
 
@@ -55,11 +56,6 @@ def propose(file: Path) -> Proposal:
         )
         spec, _ = read_mjcf(file, Additions(fixed=[re.escape(joint) for joint in fixed]))
         model = spec.copy().compile()
-    bare = set(range(1, model.nbody)) - {int(model.geom_bodyid[g]) for g in np.flatnonzero(model.geom_conaffinity)}
-    if bare:
-        notes.append(
-            f"{len(bare)} of {model.nbody - 1} bodies have no shape that touches: they pass through the ground"
-        )
     tree = Tree(model)
     limbs = tree.limbs()
     roles: dict[str, Any] = {"model": file.name}
@@ -74,11 +70,10 @@ def propose(file: Path) -> Proposal:
         )
     if fixed:
         roles["fixed"] = [re.escape(joint) for joint in fixed]
-    feet = roles.get("pairs", {}).get("feet")
-    if feet:
-        spheres = [sphere for foot in feet for sphere in soles(model, foot, notes)]
-        if spheres:
-            roles["spheres"] = spheres
+    spheres = _spheres(model, roles, notes)
+    if spheres:
+        roles["spheres"] = spheres
+    roles["head"] = _head(model, spheres)
     roles |= standing(tree, roles, _keyframe(drawn, model))
     return Proposal(roles, notes, missing)
 
@@ -186,6 +181,32 @@ def _motors(model: mujoco.MjModel, limits: Mapping[str, float], missing: list[st
             f"m^2, about {ARMATURE_PER_TORQUE:g} times the effort), or several motors"
         )
     return {"motors": motors, "joint_motors": rules}
+
+
+def _spheres(model: mujoco.MjModel, roles: Mapping[str, Any], notes: list[str]) -> list[list[Any]]:
+    """Shapes for key bodies and a head that have none: soles for the feet, a ball at the origin of the others."""
+    touching = {int(body) for body in model.geom_bodyid[model.geom_conaffinity > 0]}
+    bare = [model.body(body).name for body in range(1, model.nbody) if body not in touching]
+    feet = roles.get("pairs", {}).get("feet", ())
+    spheres = [sphere for foot in feet for sphere in soles(model, foot, notes)]
+    balls = [body for body in bare if body not in feet and (body in roles.get("key_bodies", ()) or _is_head(body))]
+    if balls:
+        notes.append(f"key bodies without a shape get a ball of {BALL} m: {', '.join(balls)}")
+    left = len(bare) - len(balls) - len(set(bare) & set(feet))
+    if left:
+        notes.append(f"{left} of {model.nbody - 1} bodies have no shape that touches: they pass through the ground")
+    return spheres + [[body, 0.0, 0.0, 0.0, BALL] for body in balls]
+
+
+def _is_head(name: str) -> bool:
+    return bool(re.search("head(?!ing)", name.lower()))
+
+
+def _head(model: mujoco.MjModel, spheres: Sequence[Sequence[Any]]) -> list[str]:
+    """The names of the head's shapes."""
+    geoms = [model.geom(int(geom)) for geom in np.flatnonzero(model.geom_conaffinity)]
+    own = [geom.name for geom in geoms if _is_head(geom.name) or _is_head(model.body(geom.bodyid[0]).name)]
+    return own + [sphere_name(body, number) for number, (body, *_) in enumerate(spheres) if _is_head(body)]
 
 
 def _ignored(tree: Tree, roles: Mapping[str, Any]) -> list[str]:

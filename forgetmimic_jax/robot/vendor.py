@@ -218,6 +218,8 @@ def _set_shapes(spec: mujoco.MjSpec, additions: Additions, notes: list[str]) -> 
     for geom in robot:
         kind = KINDS(geom.type)
         touches = bool(geom.contype or geom.conaffinity)
+        if touches and not geom.name:
+            geom.name = f"{geom.parent.name}_shape{list(geom.parent.geoms).index(geom)}"
         if kind not in PRIMITIVES and (touches or kind == KINDS.mjGEOM_MESH):
             changed[kind.name.removeprefix("mjGEOM_").lower()] = changed.get(kind.name, 0) + 1
             _make_capsule(geom)
@@ -230,10 +232,11 @@ def _set_shapes(spec: mujoco.MjSpec, additions: Additions, notes: list[str]) -> 
             geom.group = SEEN_GROUP
     if changed:
         notes.append(f"shapes that are made capsules: {', '.join(sorted(changed))}")
-    for body, *place, radius in additions.spheres:
+    for number, (body, *place, radius) in enumerate(additions.spheres):
         parent = spec.body(body)
         if parent is not None:
             parent.add_geom(
+                name=sphere_name(body, number),
                 type=KINDS.mjGEOM_SPHERE,
                 size=[radius, 0.0, 0.0],
                 pos=place,
@@ -248,6 +251,11 @@ def _set_shapes(spec: mujoco.MjSpec, additions: Additions, notes: list[str]) -> 
     if not any(geom.group == SEEN_GROUP for body in spec.bodies[1:] for geom in body.geoms):
         _add_bones(spec)
         notes.append("no shape is there to be seen: bones are drawn")
+
+
+def sphere_name(body: str, number: int) -> str:
+    """The name of the shape that a YAML's sphere becomes; number: its place in the YAML."""
+    return f"{body}_sphere{number}"
 
 
 def _make_capsule(geom: mujoco.MjsGeom) -> None:
