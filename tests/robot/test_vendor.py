@@ -369,6 +369,15 @@ def test_meshes_that_are_not_there_are_left_out(written):
     assert any("mesh files are not in" in note and "shell" in note for note in notes)
 
 
+def test_textures_that_are_not_there_are_left_out(written):
+    assets = '<asset><texture name="t" type="2d" file="t.png"/><material name="m" texture="t" rgba="1 0 0 1"/></asset>'
+    geom = ('<geom type="box" size="0.1 0.1 0.05"/>', '<geom type="box" size="0.1 0.1 0.05" material="m"/>')
+    spec, notes = read_mjcf(written(("<worldbody>", f"{assets}<worldbody>"), geom))
+    model = spec.compile()
+    np.testing.assert_array_equal(model.geom("base_shape0").rgba, [1, 0, 0, 1])
+    assert "texture files are not there: materials are left out" in notes
+
+
 def test_a_mesh_becomes_the_capsule_that_fits_it(written, tmp_path):
     """A box of 20 x 6 x 6 cm as a mesh: a capsule about x, as long as it within a few cm."""
     corners = [(x, y, z) for x in (-0.1, 0.1) for y in (-0.03, 0.03) for z in (-0.03, 0.03)]
