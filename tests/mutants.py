@@ -309,7 +309,7 @@ MUTANTS = (
            "if abs(ratio - 1.0) > 10.0:"),
     Mutant("clip_doubt", "forgetmimic_jax/motion/plausible.py", "tests/motion/test_plausible.py",
            "A reading that slides is no worse than one that stands.",
-           " + self.slide / SLIDE",
+           " + slide / SLIDE",
            ""),
     Mutant("clip_jump", "forgetmimic_jax/motion/roughness.py", "tests/motion/test_motion_files.py",
            "A root that jumps is accepted.",

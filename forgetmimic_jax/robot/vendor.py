@@ -43,14 +43,7 @@ def read_mjcf(file: Path, additions: Additions | None = None) -> tuple[mujoco.Mj
         Unreadable: MuJoCo does not read it, or it holds no robot.
     """
     additions = additions or Additions()
-    notes: list[str] = []
-    try:
-        spec = mujoco.MjSpec.from_file(str(file))
-        _leave_out_missing_meshes(spec, file, notes)
-        _name_all(spec)
-        model = spec.copy().compile()
-    except (ValueError, OSError, RuntimeError) as error:
-        raise Unreadable(f"{file.name} is no MJCF that MuJoCo reads: {' '.join(str(error).split())}") from None
+    spec, model, notes = read_unmended(file)
     _keep_inertias(spec, model)
     _keep_one_robot(spec, model, notes)
     _leave_out_what_drives(spec, notes)
@@ -60,10 +53,27 @@ def read_mjcf(file: Path, additions: Additions | None = None) -> tuple[mujoco.Mj
     return spec, notes
 
 
+def read_unmended(file: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel, list[str]]:
+    """A vendor's MJCF, compiled too, as it is but for files that are not there; everything has a name.
+
+    Raises:
+        Unreadable: MuJoCo does not read it.
+    """
+    notes: list[str] = []
+    try:
+        spec = mujoco.MjSpec.from_file(str(file))
+        _leave_out_missing_meshes(spec, file, notes)
+        _leave_out_missing_textures(spec, file, notes)
+        _name_all(spec)
+        return spec, spec.copy().compile(), notes
+    except (ValueError, OSError, RuntimeError) as error:
+        raise Unreadable(f"{file.name} is no MJCF that MuJoCo reads: {' '.join(str(error).split())}") from None
+
+
 def _leave_out_missing_meshes(spec: mujoco.MjSpec, file: Path, notes: list[str]) -> None:
     """Shapes whose mesh files are not there."""
     folder = file.parent / spec.meshdir
-    missing = {mesh.name or Path(mesh.file).stem: mesh for mesh in spec.meshes if _is_missing(mesh, folder)}
+    missing = {mesh.name or Path(mesh.file).stem: mesh for mesh in spec.meshes if _is_missing(mesh.file, folder)}
     if not missing:
         return
     for geom in list(spec.geoms):
@@ -74,8 +84,24 @@ def _leave_out_missing_meshes(spec: mujoco.MjSpec, file: Path, notes: list[str])
     notes.append(f"{len(missing)} mesh files are not in {folder} (such as {min(missing)}): their shapes are left out")
 
 
-def _is_missing(mesh: mujoco.MjsMesh, folder: Path) -> bool:
-    return bool(mesh.file) and not (folder / mesh.file).is_file() and not Path(mesh.file).is_file()
+def _leave_out_missing_textures(spec: mujoco.MjSpec, file: Path, notes: list[str]) -> None:
+    """All materials, where a texture's file is not there; their colours stay."""
+    folder = file.parent / spec.texturedir
+    names = [name for texture in spec.textures for name in (texture.file, *texture.cubefiles)]
+    if not any(_is_missing(name, folder) for name in names):
+        return
+    for geom in spec.geoms:
+        if geom.material:
+            geom.rgba, geom.material = spec.material(geom.material).rgba, ""
+    for element in (*spec.sites, *spec.skins, *spec.tendons):
+        element.material = ""
+    for element in (*spec.materials, *spec.textures):
+        spec.delete(element)
+    notes.append("texture files are not there: materials are left out")
+
+
+def _is_missing(name: str, folder: Path) -> bool:
+    return bool(name) and not (folder / name).is_file() and not Path(name).is_file()
 
 
 def _name_all(spec: mujoco.MjSpec) -> None:
@@ -218,6 +244,8 @@ def _set_shapes(spec: mujoco.MjSpec, additions: Additions, notes: list[str]) -> 
     for geom in robot:
         kind = KINDS(geom.type)
         touches = bool(geom.contype or geom.conaffinity)
+        if touches and not geom.name:
+            geom.name = f"{geom.parent.name}_shape{list(geom.parent.geoms).index(geom)}"
         if kind not in PRIMITIVES and (touches or kind == KINDS.mjGEOM_MESH):
             changed[kind.name.removeprefix("mjGEOM_").lower()] = changed.get(kind.name, 0) + 1
             _make_capsule(geom)
@@ -230,10 +258,11 @@ def _set_shapes(spec: mujoco.MjSpec, additions: Additions, notes: list[str]) -> 
             geom.group = SEEN_GROUP
     if changed:
         notes.append(f"shapes that are made capsules: {', '.join(sorted(changed))}")
-    for body, *place, radius in additions.spheres:
+    for number, (body, *place, radius) in enumerate(additions.spheres):
         parent = spec.body(body)
         if parent is not None:
             parent.add_geom(
+                name=sphere_name(body, number),
                 type=KINDS.mjGEOM_SPHERE,
                 size=[radius, 0.0, 0.0],
                 pos=place,
@@ -248,6 +277,11 @@ def _set_shapes(spec: mujoco.MjSpec, additions: Additions, notes: list[str]) -> 
     if not any(geom.group == SEEN_GROUP for body in spec.bodies[1:] for geom in body.geoms):
         _add_bones(spec)
         notes.append("no shape is there to be seen: bones are drawn")
+
+
+def sphere_name(body: str, number: int) -> str:
+    """The name of the shape that a YAML's sphere becomes; number: its place in the YAML."""
+    return f"{body}_sphere{number}"
 
 
 def _make_capsule(geom: mujoco.MjsGeom) -> None:
