@@ -15,10 +15,11 @@
 ## OUTPUT       where the results go (default: under runs/)
 ## RESUME       1 continues the run in OUTPUT
 ## SWEEP        lambda, targets, sampler or seeds (default: lambda)
+## CLUSTER      address of a dask scheduler whose workers run the trials of sweep and experiments (default: none)
 ## ARGS         flags as they are, and what comes before them; ARGS=--help lists all flags
 ## PYTHON       the Python that .venv is made from, 3.11 to 3.14 (default: the first found)
 PROGRAM = .venv/bin/python -m forgetmimic_jax
-SWITCHES = RESUME WRENCH DRAW DRY FORCE MIX_COMMITS FULL FAKES
+SWITCHES = RESUME WRENCH DRAW DRY FORCE MIX_COMMITS NO_STOP FULL FAKES
 
 # The variables of the command line as flags; a switch has no value.
 given = $(foreach name,$(.VARIABLES),$(if $(filter command,$(origin $(name))),$(name)))
@@ -27,7 +28,7 @@ flag_value = $(if $(filter $(1),$(SWITCHES)),$(filter-out 1,$($(1))),'$(subst ',
 flag = $(if $($(1)),--$(call flag_name,$(1)) $(call flag_value,$(1)))
 FLAGS = $(foreach name,$(filter-out ARGS PYTHON SWEEP,$(given)),$(call flag,$(name)))
 
-COMMANDS = pretrain train unlearn evaluate evidence export play video report motions bench
+COMMANDS = pretrain train unlearn evaluate evidence export play video report motions robot bench
 STUDIES = validity comparison penalty heat_map motion_types physical_behaviour training_dynamics relearning membership \
 	number_of_targets
 
@@ -52,6 +53,7 @@ export: ## write CHECKPOINT as ONNX for deploy tools, checked in plain MuJoCo
 play: ## watch CHECKPOINT live in a web page, beside its base
 video: ## film CHECKPOINT clip by clip, beside its base: MP4, GIF and a page of stills
 report: ## write one HTML page about the unlearning run in RUN
+robot: ## make a robot of a vendor's MJCF (ARGS=--help says how)
 motions: ## make a library from your own clips (ARGS=--help says how)
 bench: ## measure the speed of training on this machine
 $(COMMANDS): .venv/.installed

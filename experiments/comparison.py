@@ -37,7 +37,7 @@ METHODS: dict[str, dict[str, Any]] = {
         name.replace("_", " "): {"method": name}
         for name in (
             *("random_reward", "decremental", "poisoning", "trajdeleter"),
-            *("negated_reward", "gradient_ascent", "policy_edit", "distill"),
+            *("negated_reward", "gradient_ascent", "policy_edit", "distill", "stand"),
         )
     },
     ARFT: {},
@@ -67,7 +67,8 @@ def body(document: Document) -> str:
     if conditions["preset"] == "cpu":
         parts.append(
             "*decremental* and *policy edit* have losses of their own, without the KL to the base and the clips' "
-            "weights; of the cpu preset they have the starts, and *plain PPO* has not.\n"
+            "weights; of the cpu preset they have the starts, and *plain PPO* has not. *stand* has a loss of its own "
+            "with the clips' weights.\n"
         )
         steps = {"distill": distill.PACE.ppo["cpu"], "the others": SHORT}
         counts = ", ".join(f"{name} {of['minibatches'] * of['epochs']}" for name, of in steps.items())

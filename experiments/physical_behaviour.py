@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -97,16 +97,11 @@ def unbounded_table(policies: Document) -> str:
         return ""
     rows = []
     for name, label in tables.UNBOUNDED.items():
-        source = "impact_force" if name.startswith("impact_force") else name
-        cells = []
-        for runs in policies.values():
-            values = [[value for value in run[source] if value is not None] for run in runs.values()]
-            defined = [reduced(name, of) for of in values if of]
-            rate = name.endswith("_rate")
-            high = 1.0 if rate or "share" in label else np.inf
-            estimate = within(statistics.over_seeds(defined), -1.0 if name == "motion_content" else 0.0, high)
-            cells.append((percent(estimate) if rate else number(estimate, 2)) if defined else "")
-        rows.append([label, *cells])
+        rate = name.endswith("_rate")
+        lowest = metrics.LOWEST_CONTENT if name == "motion_content" else 0.0
+        highest = 1.0 if rate or "share" in label or name == "motion_content" else np.inf
+        estimates = (unbounded_over_runs(policies, of, name) for of in policies)
+        rows.append([label, *((percent if rate else number)(within(one, lowest, highest)) for one in estimates)])
     note = (
         "The targets without terminations, to the clip's end and 3 s longer with its last frame held, and with "
         "self-collision. `docs/method.md` defines the numbers.\n"
@@ -114,13 +109,13 @@ def unbounded_table(policies: Document) -> str:
     return f"\n**Without terminations**\n\n{markdown_table(['', *policies], rows)}\n{note}"
 
 
-def reduced(name: str, values: Sequence[float]) -> float:
-    """A number of one run from its episodes."""
-    if name == "impact_force_median":
-        return float(np.quantile(values, 0.5, method="inverted_cdf"))
-    if name == "impact_force_95":
-        return float(np.quantile(values, 0.95, method="inverted_cdf"))
-    return float(np.mean(values))
+def unbounded_over_runs(policies: Document, label: str, name: str) -> Estimate | None:
+    """A number of `tables.UNBOUNDED` of a kind of policy, over its runs; None where no run defines it."""
+    quantile = {"impact_force_median": 0.5, "impact_force_95": 0.95}.get(name)
+    runs = [run["impact_force" if quantile else name] for run in policies[label].values()]
+    defined = [[value for value in run if value is not None] for run in runs]
+    found = [np.quantile(run, quantile, method="inverted_cdf") if quantile else np.mean(run) for run in defined if run]
+    return statistics.over_seeds(found) if found else None
 
 
 def findings(document: Document) -> Iterator[Finding]:

@@ -14,12 +14,13 @@ from pathlib import Path
 from forgetmimic_jax.basics.errors import InputError, nearest, run_command
 
 PACKAGE = Path(__file__).parent
+SINGULAR = {"robots": "robot"}  # `robot` is a folder of the package, so its command's module has another name
 
 
 def commands() -> dict[str, str]:
     """What every command does, by its name; nothing is imported, so the list appears at once."""
     names = [module.name for module in pkgutil.iter_modules([str(PACKAGE)]) if not module.ispkg]
-    return {name.replace("_", "-"): _summary(name) for name in names if name != "__main__"}
+    return {_command(name): _summary(name) for name in names if name != "__main__"}
 
 
 def main() -> None:
@@ -39,7 +40,16 @@ def _run(arguments: list[str]) -> None:
     if name not in known:
         raise InputError(f"no command '{name}'; {nearest(name, known)}")
     sys.argv = [f"forgetmimic {name}", *rest]
-    runpy.run_module(f"forgetmimic_jax.{name.replace('-', '_')}", run_name="__main__", alter_sys=True)
+    runpy.run_module(f"forgetmimic_jax.{module_of(name)}", run_name="__main__", alter_sys=True)
+
+
+def module_of(command: str) -> str:
+    """The module of a command."""
+    return next((module for module, name in SINGULAR.items() if name == command), command.replace("-", "_"))
+
+
+def _command(module: str) -> str:
+    return SINGULAR.get(module, module.replace("_", "-"))
 
 
 def _summary(module: str) -> str:

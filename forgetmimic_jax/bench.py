@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import statistics
+import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from forgetmimic_jax.basics.errors import InputError, run_command
 from forgetmimic_jax.settings.config import EngineName, Preset
 from forgetmimic_jax.settings.options import at_least, on_engine, parse, replace_given
+
+ROUNDS = 2  # processes of each side in a comparison with another commit
 
 
 @dataclass
@@ -31,6 +35,10 @@ class Options:
     """Folder of clips; data/ROBOT by default."""
     repeats: int = 7
     """Times each measurement is taken; the median counts, rounds of all measurements alternate."""
+    dry: bool = False
+    """Simulate nothing; print the memory that an iteration needs, as XLA computes it."""
+    against: str | None = None
+    """Commit to compare with. Both are measured in turns on the default settings."""
     output: Path | None = None
     """JSON file for the figures; only printed by default."""
 
@@ -38,128 +46,93 @@ class Options:
 def main(options: Options) -> None:
     """Measure and print a table."""
     started = time.perf_counter()
-    import jax
-    import jax.numpy as jnp
-    from rich.console import Console
-    from rich.table import Table
-
-    from forgetmimic_jax.physics.choose import resolve_engine
-    from forgetmimic_jax.ppo.collect import collect
-    from forgetmimic_jax.ppo.rule import Rule
-    from forgetmimic_jax.ppo.update import make_iteration
     from forgetmimic_jax.settings.config import preset
-    from forgetmimic_jax.tracking import env as tracking
-    from forgetmimic_jax.tracking.action import to_joint_target
     from forgetmimic_jax.tracking.setup import make_setup
     from forgetmimic_jax.training.folder import check_writable
-    from forgetmimic_jax.training.start import start_state
 
     at_least(1, "--repeats", options.repeats)
     if options.output:
         check_writable(options.output.parent)
         if options.output.is_dir():
             raise InputError(f"{options.output}: a folder; --output is a file")
-    config = replace_given(preset(options.preset), robot=options.robot, library=options.library)
-    config = on_engine(config, options.physics)
-    setup = make_setup(config)
-    env, assets, steps = (
-        tracking.make_environment(setup, config.ppo.num_envs),
-        tracking.make_assets(setup),
-        config.ppo.num_steps,
-    )
-    state = start_state(setup, env, assets)
-    first_iteration = make_iteration(env, Rule())
-    state, _ = jax.block_until_ready(first_iteration(assets, state))
-    to_first_step = time.perf_counter() - started
-    probabilities = tracking.start_probabilities(config, assets, state.failure_level)
-    gains = jnp.zeros_like(probabilities)
+    if options.against:
+        figures = compared(options.against, options)
+        show(figures["over"], f"this code over {options.against}")
+    else:
+        config = replace_given(preset(options.preset), robot=options.robot, library=options.library)
+        setup = make_setup(on_engine(config, options.physics))
+        from forgetmimic_jax.training.speed import memory, speed
 
-    @jax.jit
-    def environment(assets, episodes, key):
-        def one_step(episodes, key):
-            action_key, step_key, reset_key, observe_key = jax.random.split(key, 4)
-            action = config.ppo.initial_std * jax.random.normal(action_key, (env.num_envs, env.robot.num_joints))
-            after, result = tracking.step(env, assets, episodes, action, step_key)
-            done = result.terminated | result.truncated
-            fresh = tracking.reset_where(env, assets, after, done, reset_key, probabilities, gains)
-            observation = tracking.observe(env, assets, fresh, observe_key)
-            reference = tracking.lookup(assets.library, episodes.clip, episodes.frame + 1)
-            joint_target = to_joint_target(config.action.mode, assets.robot, reference, action)
-            return fresh, (episodes.physics, joint_target, observation[0].sum(), result.reward.tracking.sum())
-
-        return jax.lax.scan(one_step, episodes, jax.random.split(key, steps))
-
-    collect_only = jax.jit(lambda assets, state: collect(env, assets, state, Rule()))
-    _, (physics, targets, *_) = jax.block_until_ready(environment(assets, state.env, jax.random.PRNGKey(1)))
-    jax.block_until_ready(collect_only(assets, state))
-    raw = _raw_stepping(setup.robot.model, env.num_envs, config.physics.substeps, physics, targets)
-
-    measured: dict[str, list[float]] = {"raw": [], "environment": [], "collect": [], "iteration": []}
-    for repeat in range(options.repeats):
-        measured["raw"].append(raw())
-        measured["environment"].append(_timed(environment, assets, state.env, jax.random.PRNGKey(repeat)))
-        measured["collect"].append(_timed(collect_only, assets, state))
-        begin = time.perf_counter()
-        state, _ = jax.block_until_ready(first_iteration(assets, state))
-        measured["iteration"].append(time.perf_counter() - begin)
-    median = {name: statistics.median(values) for name, values in measured.items()}
-    env_steps = env.num_envs * steps
-    memory_unit = 2**30 if sys.platform == "darwin" else 2**20  # the system counts in bytes there, in KiB elsewhere
-    figures = {
-        "engine": resolve_engine(config.physics.engine),
-        "cores": os.cpu_count(),
-        "environments": env.num_envs,
-        "raw_control_steps_per_second": env_steps / median["raw"],
-        "environment_control_steps_per_second": env_steps / median["environment"],
-        "environment_over_raw": median["raw"] / median["environment"],
-        "iteration_control_steps_per_second": env_steps / median["iteration"],
-        "iteration_beyond_simulation_over_simulation": (median["iteration"] - median["raw"]) / median["raw"],
-        "share_physics": median["raw"] / median["iteration"],
-        "share_environment": (median["environment"] - median["raw"]) / median["iteration"],
-        "share_policy_in_rollout": (median["collect"] - median["environment"]) / median["iteration"],
-        "share_update": (median["iteration"] - median["collect"]) / median["iteration"],
-        "seconds_to_first_iteration": to_first_step,
-        "peak_memory_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / memory_unit,
-    }
-    table = Table(title=f"{config.robot}, preset {config.preset}, {figures['engine']} engine", title_justify="left")
-    table.add_column("figure")
-    table.add_column("value", justify="right")
-    for name, value in figures.items():
-        table.add_row(name.replace("_", " "), f"{value:,.2f}" if isinstance(value, float) else str(value))
-    Console().print(table)
+        figures = memory(setup) if options.dry else speed(setup, repeats=options.repeats, started=started)
+        show(figures, f"{options.robot}, preset {options.preset}, {figures['engine']} engine")
     if options.output:
         options.output.parent.mkdir(parents=True, exist_ok=True)
         options.output.write_text(json.dumps(figures, indent=2) + "\n")
         print(f"figures  {options.output}")
 
 
-def _raw_stepping(model, num_envs: int, substeps: int, physics, targets) -> Callable[[], float]:
-    """Seconds that plain `mujoco.batch` needs for the same states and targets; loading them is not counted."""
-    import mujoco
-    import mujoco.batch
-    import numpy as np
+def show(figures: Mapping[str, Any], title: str) -> None:
+    """Print the figures as a table."""
+    from rich.console import Console
+    from rich.table import Table
 
-    batch = mujoco.batch.Batch(model, num_envs)
-    rows = [np.asarray(x, np.float64) for x in (physics.qpos, physics.qvel, physics.warmstart, targets)]
-
-    def run() -> float:
-        seconds = 0.0
-        for qpos, qvel, warmstart, joint_target in zip(*rows, strict=True):
-            batch.qpos[:], batch.qvel[:], batch.qacc_warmstart[:], batch.ctrl[:] = qpos, qvel, warmstart, joint_target
-            begin = time.perf_counter()
-            batch.step(nstep=substeps, stage=int(mujoco.mjtStage.mjSTAGE_VEL))
-            seconds += time.perf_counter() - begin
-        return seconds
-
-    return run
+    table = Table(title=title, title_justify="left")
+    table.add_column("figure")
+    table.add_column("value", justify="right")
+    for name, value in figures.items():
+        table.add_row(name.replace("_", " "), f"{value:,.2f}" if isinstance(value, float) else str(value))
+    Console().print(table)
 
 
-def _timed(function: Callable[..., object], *arguments: object) -> float:
-    import jax
+def compared(commit: str, options: Options) -> dict[str, Any]:
+    """The figures of this code and of another commit, each process in turn, and this code's over the other's.
 
-    begin = time.perf_counter()
-    jax.block_until_ready(function(*arguments))
-    return time.perf_counter() - begin
+    Raises:
+        InputError: flags that the other commit may not know, no git checkout, or an unknown commit.
+    """
+    for name in ("preset", "physics", "library", "dry"):
+        if getattr(options, name) != getattr(Options(), name):
+            raise InputError(f"--{name}: does not go with --against, which measures the default settings")
+    checkout = Path(__file__).resolve().parents[1]
+    with tempfile.TemporaryDirectory() as folder:
+        other = Path(folder) / "other"
+        _git(checkout, ["worktree", "add", "--detach", str(other), commit], commit)
+        try:
+            sides: dict[str, list[dict[str, Any]]] = {"this": [], "other": []}
+            for _ in range(ROUNDS):
+                for name, root in (("this", checkout), ("other", other)):
+                    sides[name].append(_figures_of(root, Path(folder) / "figures.json", options))
+        finally:
+            _git(checkout, ["worktree", "remove", "--force", str(other)], commit)
+    this, that = (_medians(sides[name]) for name in ("this", "other"))
+    over = {name: value / that[name] for name, value in this.items() if that.get(name)}
+    return {"this": this, "other": that, "over": over}
+
+
+def _figures_of(root: Path, output: Path, options: Options) -> dict[str, Any]:
+    """The figures that the code in folder `root` measures in a process of its own."""
+    command = [sys.executable, "-m", "forgetmimic_jax.bench", "--output", str(output)]
+    command += ["--robot", options.robot, "--repeats", str(options.repeats)]
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True)
+    if done.returncode:
+        last = (done.stderr or done.stdout).strip().splitlines()[-1:]
+        raise InputError(f"{root}: its bench ended with exit code {done.returncode}: {' '.join(last)}")
+    figures: dict[str, Any] = json.loads(output.read_text())
+    return figures
+
+
+def _medians(runs: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """The median over the runs of every figure that is a number."""
+    numbers = [name for name, value in runs[0].items() if isinstance(value, float)]
+    return {name: statistics.median(run[name] for run in runs) for name in numbers}
+
+
+def _git(checkout: Path, arguments: Sequence[str], commit: str) -> None:
+    done = subprocess.run(["git", "-C", str(checkout), *arguments], capture_output=True, text=True)
+    if done.returncode:
+        why = done.stderr.strip().splitlines()[-1:]
+        raise InputError(f"--against: found {commit}; accepted: a commit of the checkout ({' '.join(why)})")
 
 
 if __name__ == "__main__":

@@ -1,36 +1,57 @@
-"""Make a base checkpoint of an rsl_rl or ONNX policy: `forgetmimic import-policy --policy model_3000.pt`."""
+"""Make a base of policies of other projects: `forgetmimic import-policy policy.onnx`."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
+
+import tyro
 
 from forgetmimic_jax.basics.errors import InputError, run_command
 from forgetmimic_jax.settings.config import Preset
 from forgetmimic_jax.settings.options import at_least, parse, replace_given
 
 if TYPE_CHECKING:
-    from jax import Array
+    from forgetmimic_jax.exchange.adopt import Adopted
+    from forgetmimic_jax.exchange.foreign import ForeignPolicy
+    from forgetmimic_jax.exchange.trial import Tracked
+    from forgetmimic_jax.robot.model import Robot
+    from forgetmimic_jax.settings.config import Config
 
-    from forgetmimic_jax.tracking.setup import Setup
+    References = Mapping[str, Mapping[str, float]]
 
 
 @dataclass
 class Options:
-    """Turn a tracking policy of rsl_rl, or an ONNX actor, into a base checkpoint to unlearn from and to evaluate.
+    """Turn tracking policies of other projects into a base to evaluate, to watch and to unlearn from.
 
-    Its observations, actions, gains and joint order must be those of this project (layout wbc132, docs/method.md). The
-    actions of the new checkpoint are compared with the original's before anything is written.
+    Layouts: wbc132 (wbc-mjlab), mjlab160 and mjlab154 (mjlab, BeyondMimic, unitree_rl_lab, unitree_rl_mjlab). What a
+    policy sees and does is read by name from its ONNX metadata, deploy.yaml or config.yaml. Before anything is written,
+    the policy is rolled out on its clip, and its actions are compared with the original's. Several policies become one.
     """
 
-    policy: Path
-    """The policy: a checkpoint of rsl_rl (.pt), or an ONNX file with input obs and output actions."""
+    files: tyro.conf.Positional[tuple[Path, ...]]
+    """The policies: ONNX files, or checkpoints of rsl_rl (.pt)."""
     robot: str = "g1"
     """Robot under robots/."""
     library: Path | None = None
-    """Folder of the clips it was trained on; data/ROBOT by default."""
+    """Folder of clips in the place of the policy's own; data/ROBOT by default, where it has none."""
+    layout: str | None = None
+    """Layout of a policy that does not say it; with several policies, of the one that they become."""
+    action_mode: Literal["residual", "offset"] | None = None
+    """What actions are added to, reference or default pose, where a policy does not say it; with several policies, of
+    the one that they become."""
+    fps: float | None = None
+    """Frames per second of a motion file beside a policy whose name does not say it."""
+    start: float = 0.0
+    """First second of a policy's clip to take."""
+    reference: Path | None = None
+    """JSON or YAML with joint_error (rad) and reward that the roll-out must give to 0.01, also by clip."""
+    episodes: int = 20
+    """Episodes with reset noise, a clip."""
     preset: Preset = "cpu"
     """Settings for further training: cpu for a laptop, paper for a GPU."""
     activation: str | None = None
@@ -38,96 +59,129 @@ class Options:
     std: float = 0.4
     """Standard deviation of the exploration noise, in units of action, where the file has none (an ONNX)."""
     seed: int = 0
-    """Seed of the fresh critic."""
+    """Seed of the episodes, of the fresh critic, and of the network that several policies become."""
     output: Path | None = None
-    """Folder of the checkpoint; runs/import-ROBOT by default."""
-
-
-TOLERANCE = 1e-5  # of an action, or of 1 where the action is smaller
-OBSERVATIONS = 20  # a clip, at which the actions are compared
-READERS = (".pt", ".pth", ".onnx")
+    """Folder for base/ and, with clips of the policies' own, library/; runs/import-ROBOT by default."""
 
 
 def main(options: Options) -> None:
-    """Read, compare and write."""
-    import jax.numpy as jnp
-    import numpy as np
-    from rich.console import Console
-
+    """Read, roll out, compare and write."""
     from forgetmimic_jax.basics.console import closing, command_line
-    from forgetmimic_jax.exchange.imported import check_actor, notes, with_actor, within_limit
-    from forgetmimic_jax.exchange.onnx_actor import OnnxActor
-    from forgetmimic_jax.exchange.onnx_reader import read_onnx
-    from forgetmimic_jax.exchange.rsl_rl import read_rsl_rl
+    from forgetmimic_jax.exchange.adopt import LIBRARY, read_reference, write_base
+    from forgetmimic_jax.exchange.foreign import Reading, read_policy
     from forgetmimic_jax.policy.gaussian import MAX_STD, MIN_STD
-    from forgetmimic_jax.policy.normalizer import OBSERVATION_LIMIT
     from forgetmimic_jax.robot.model import load_robot
     from forgetmimic_jax.settings.config import preset
-    from forgetmimic_jax.tracking.env import make_assets
     from forgetmimic_jax.tracking.layouts import find_layout
-    from forgetmimic_jax.tracking.rsi import initial_failure_level
-    from forgetmimic_jax.tracking.setup import make_setup
-    from forgetmimic_jax.training import checkpoint
     from forgetmimic_jax.training.folder import prepare_folder
-    from forgetmimic_jax.training.start import fresh_policy
 
     at_least(0, "--seed", options.seed)
+    at_least(1, "--episodes", options.episodes)
     if not MIN_STD <= options.std <= MAX_STD:
         raise InputError(f"--std: found {options.std:g}; accepted: {MIN_STD:g} to {MAX_STD:g}")
+    if not options.files:
+        raise InputError("FILE: no policy named; accepted: ONNX files and checkpoints of rsl_rl")
+    if options.layout is not None:
+        find_layout(options.layout)
     output = options.output or Path("runs") / f"import-{options.robot}"
     prepare_folder(output, resume=False)
+    references = read_reference(options.reference)
     robot = load_robot(options.robot)
-    suffix = options.policy.suffix.lower()
-    if suffix not in READERS:
-        raise InputError(f"{options.policy}: suffix: found '{suffix}'; accepted: {', '.join(READERS)}")
-    is_onnx = suffix == ".onnx"
     config = replace_given(preset(options.preset), robot=options.robot, library=options.library, seed=options.seed)
-    actor = read_onnx(options.policy, robot, config) if is_onnx else read_rsl_rl(options.policy, options.activation)
-    check_actor(actor, find_layout(config.observation.layout), robot, options.policy)
+    reading = Reading(activation=options.activation, fps=options.fps, start=options.start)
+    if len(options.files) == 1:
+        reading = dataclasses.replace(reading, layout=options.layout, mode=options.action_mode)
+    policies = [read_policy(path, robot, config.physics.control_step, reading) for path in options.files]
+    if len(policies) == 1:
+        made = _one(options, policies[0], config, references)
+    else:
+        made = _several(options, policies, config, robot, references)
+    base = write_base(output, made)
+    files = {"base policy": base, **({"library": output / LIBRARY} if made.clips else {})}
+    closing(files, command_line("evaluate", robot=options.robot, checkpoint=base))
 
-    config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, actor_layers=actor.hidden_layers))
-    setup = make_setup(config)
-    assets = make_assets(setup)
-    policy = with_actor(fresh_policy(setup, assets), actor, options.std)
 
-    observations = np.asarray(_observations(setup, options.seed))
-    original = OnnxActor(options.policy) if is_onnx else None
-    expected = np.stack([original(each) for each in observations]) if original else actor(observations)
-    found = np.asarray(policy.mean_action(jnp.asarray(observations)))
-    inside = within_limit(policy, observations)
-    if not inside.any():
-        raise InputError(
-            f"{options.policy}: every observation of the clips lies past {OBSERVATION_LIMIT:g} standard "
-            f"deviations of its normaliser; is its observation layout another?"
+def _one(options: Options, foreign: ForeignPolicy, config: Config, references: References) -> Adopted:
+    """A policy as it is; prints what was read of it and how it did."""
+    from forgetmimic_jax.exchange.adopt import adopt, check_reference
+    from forgetmimic_jax.exchange.imported import notes
+
+    made = adopt(foreign, config, std=options.std, episodes=options.episodes, seed=options.seed)
+    check_reference(options.reference, references, made.trial.clips)
+    _say_read(foreign)
+    _say_figures({"": made.trial.clips})
+    _say("\n".join([*made.facts, *notes(foreign.actor, options.std)]))
+    return made
+
+
+def _several(
+    options: Options, policies: Sequence[ForeignPolicy], config: Config, robot: Robot, references: References
+) -> Adopted:
+    """One policy of several, by regression; prints what was read of them, and how they and the new one did."""
+    from forgetmimic_jax.basics.console import progress
+    from forgetmimic_jax.exchange import experts
+    from forgetmimic_jax.exchange.adopt import Adopted, adopt, check_reference, own_setup
+    from forgetmimic_jax.exchange.trial import try_out
+    from forgetmimic_jax.training.checkpoint import Progress
+
+    experts.check_clips(policies, options.library)
+    wanted = experts.student_config(config, policies, robot, options.layout, options.action_mode)
+    taught = [adopt(one, config, std=options.std, episodes=options.episodes, seed=options.seed) for one in policies]
+    known = {name: tracked for one in taught for name, tracked in one.trial.clips.items()}
+    check_reference(options.reference, references, known)
+    for foreign, one in zip(policies, taught, strict=True):
+        _say_read(foreign)
+        _say("\n".join(one.facts))
+    setup = own_setup(wanted, [clip for one in taught for clip, _ in one.clips])
+    teachers = [(experts.expert(one.setup, one.policy, setup), [place]) for place, one in enumerate(taught)]
+    merging = experts.MERGING
+    steps = experts.ROBOTS * merging.steps
+    with progress("merge", merging.rounds) as report:
+        result = experts.merge(
+            setup, teachers, merging, lambda state, found: report(int(state.round), int(state.round) * steps, found)
         )
-    error = float((np.abs(found - expected) / np.maximum(1.0, np.abs(expected)))[inside].max(initial=0.0))
-    if not error <= TOLERANCE:
-        raise InputError(f"{options.policy}: actions differ from the original's by {error:.1e}; nothing was written")
-    level = initial_failure_level(config.sampling, assets.bins)
-    checkpoint.save_policy(output, setup, policy, level, checkpoint.Progress(actor.iteration, environment_steps=0))
-    facts = [f"Actions equal the original's to {error:.0e} at {inside.sum()} observations of the clips."]
-    if not inside.all():
-        facts.append(
-            f"{(~inside).sum()} more lie past {OBSERVATION_LIMIT:g} standard deviations, where ours clips them."
-        )
-    facts += notes(actor, options.std)
-    if not is_onnx:
-        facts.append("A .pt does not name its observations and joints: they are taken to be in this project's order.")
-    Console().print("\n".join(facts), highlight=False, soft_wrap=True)
-    following = command_line("evaluate", robot=options.robot, library=options.library, checkpoint=output)
-    closing({"base policy": output}, following)
+    trial = try_out(setup, result.state.student, episodes=options.episodes, seed=options.seed)
+    _say_figures({"experts": known, "new policy": trial.clips})
+    shortfalls = experts.shortfalls(known, trial.clips)
+    _say("\n".join(shortfalls or ["The new policy is within 2 points of survival and 0.02 of reward of every expert."]))
+    clips = tuple(pair for one in taught for pair in one.clips)
+    return Adopted(setup, result.state.student, trial, clips, Progress(0, int(result.state.round) * steps), ())
 
 
-def _observations(setup: Setup, seed: int) -> Array:
-    """Actor observations [n, features] all along every clip, the robot on the reference but for the reset noise."""
-    import jax
+def _say_read(foreign: ForeignPolicy) -> None:
+    """What was taken from where, and what had to be assumed."""
+    _say_table(str(foreign.path), [("", "found", "from"), *foreign.rows])
 
-    from forgetmimic_jax.evaluation.rollout import Evaluator
-    from forgetmimic_jax.tracking.env import make_assets, make_environment, observe
 
-    evaluator = Evaluator(setup, episodes=OBSERVATIONS, seed=seed)
-    env = make_environment(setup, len(evaluator.clip), noisy=False)
-    return jax.jit(lambda assets, state: observe(env, assets, state, None)[0])(make_assets(setup), evaluator.start())
+def _say_figures(trials: Mapping[str, Mapping[str, Tracked]]) -> None:
+    """The figures of every clip, of one policy after another."""
+    rows = [("clip", "episodes", "survival", "reward", "joint error")]
+    for name, clips in trials.items():
+        for clip, of in clips.items():
+            whole = f"{of.seconds:.1f} of {of.horizon:.1f} s"
+            shown = (("no noise", whole, of.reward, of.joint_error),
+                     ("reset noise", f"{of.survival:.0%}", of.noisy_reward, of.noisy_joint_error))  # fmt: skip
+            for episodes, survival, reward, error in shown:
+                label = f"{clip} ({name})" if name else clip
+                rows.append((label, episodes, survival, f"{reward:.3f}", f"{error:.3f} rad"))
+    _say_table("Roll-outs", rows)
+    _say(
+        "no noise: one episode from the first frame to the clip's end. reset noise: episodes of 10 s at most.\n"
+        "reward: mean tracking reward while alive. joint error: mean over steps and joints.\n"
+    )
+
+
+def _say_table(title: str, rows: Sequence[Sequence[str]]) -> None:
+    """Rows of text in columns, each as wide as it must be."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    _say("\n".join([title, *(f"  {line}" for line in lines), ""]))
+
+
+def _say(text: str) -> None:
+    from rich.console import Console
+
+    Console().print(text, highlight=False, markup=False, soft_wrap=True)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -21,13 +21,14 @@ if TYPE_CHECKING:
 
 @dataclass
 class Import:
-    """Add a motion file to a library: a LAFAN1-style CSV, an mjlab / BeyondMimic NPZ or a GMR pickle.
+    """Add a motion file to a library: a CSV, an mjlab / BeyondMimic / wbc-mjlab NPZ or a GMR / MimicKit pickle.
 
-    The clip is resampled to 50 Hz, clipped to the joints' limits and set on the floor. It is written after every check
-    has passed."""
+    The file is compared with the robot and with all that it says itself. The clip is resampled to 50 Hz, clipped to the
+    joints' limits and set on the ground. It is written after every check has passed."""
 
     file: tyro.conf.Positional[Path]
-    """The .csv, .npz or .pkl. CSV: root position m, quaternion xyzw, joints rad in the robot's order."""
+    """The .csv, .npz or .pkl. A CSV without names: root position m, quaternion xyzw, joints rad in the robot's
+    order."""
     name: str | None = None
     """Name of the clip; the file's by default."""
     fps: float | None = None
@@ -38,12 +39,21 @@ class Import:
     """Last second to take; the file's end by default."""
     library: Path | None = None
     """Folder of the library; a missing one is made. runs/library-ROBOT by default."""
-    quaternion_order: Literal["auto", "xyzw", "wxyz"] = "auto"
+    joint_order: Literal["auto", "robot", "isaac"] = "auto"
+    """Order of joints that the file does not name. isaac: Isaac Lab's, level by level. auto: the format's own; an NPZ
+    must show it by its bodies."""
+    quaternion: Literal["auto", "xyzw", "wxyz"] = "auto"
     """Order of the root's quaternion. auto: the format's own (CSV and pickle xyzw, NPZ wxyz)."""
-    assume_robot_order: bool = False
-    """An NPZ without joint_names and body_names is in the robot's order, root first."""
+    up: Literal["z", "y"] = "z"
+    """Axis of the file's world that points up."""
+    unit: Literal["m", "cm", "mm"] = "m"
+    """Unit of the file's positions."""
+    angles: Literal["radians", "degrees"] = "radians"
+    """Unit of the file's joint angles."""
+    fill_missing: bool = False
+    """Hold joints that the file lacks at their default angle."""
     keep_height: bool = False
-    """Leave the heights as they are. Otherwise the soles are set on the floor."""
+    """Leave the heights as they are. Otherwise the soles are set on the ground, at most 0.3 m away."""
     licence: str = "unknown"
     """Licence of the motion, for the manifest."""
     force: bool = False
@@ -66,10 +76,11 @@ class Retarget:
 
 @dataclass
 class Check:
-    """Measure every clip of a library and name those outside its bounds; the exit code is then 2.
+    """Measure every clip of a library. The exit code is 2 where a clip is no motion of the robot.
 
-    Measured: floor contact, joint limits, smoothness, seams, flight; acceleration that no contact can give, in the
-    worst 0.2 s (*missing*); motor torque over its limit, in the worst 0.1 s (*torque*)."""
+    What is only rougher than the shipped clips is a note. Measured: the root's speed (*root*), floor contact, joint
+    limits, smoothness, seams, flight; acceleration that no contact can give, in the worst 0.2 s (*missing*); motor
+    torque over its limit, in the worst 0.1 s (*torque*)."""
 
     library: Path | None = None
     """Folder of clips; data/ROBOT by default."""
@@ -140,17 +151,16 @@ def main(options: Options) -> None:
 def import_motion(robot: Robot, options: Import) -> None:
     """Make a clip of a motion file and add it to a library."""
     from forgetmimic_jax.motion import importing, library
-    from forgetmimic_jax.motion.readers import Reading
+    from forgetmimic_jax.motion.recording import Reading
     from forgetmimic_jax.motion.table import quality_table
 
     folder, name = options.library or Path("runs") / f"library-{robot.name}", options.name or options.file.stem
     library.manifest_for(folder, robot, name, importing.FPS, overwrite=options.force)
-    reading = Reading(name, options.fps, options.quaternion_order, options.assume_robot_order)
-    imported = importing.import_motion(
-        robot, options.file, reading, start=options.start, end=options.end, keep_height=options.keep_height
-    )
+    reading = Reading(**{field.name: getattr(options, field.name) for field in fields(Reading)})
+    imported = importing.import_motion(robot, options.file, reading, keep_height=options.keep_height)
     facts = {**imported.facts, "licence": options.licence}
     file = library.add_clip(folder, robot, imported.clip, facts, overwrite=options.force)
+    print("\n".join(imported.notes), end="\n\n")
     print(quality_table([imported.quality], {}))
     closing({"clip": file, "library": folder}, _train(robot, folder))
 
@@ -181,9 +191,11 @@ def check(robot: Robot, options: Check) -> None:
         draw(robot, clips, spans, options.draw)
         files["drawing"] = options.draw
     closing(files, _train(robot, folder))
-    failed = [quality.name for quality in measures if quality.failures()]
+    failed = [quality.name for quality in measures if quality.faults()]
     if failed:
-        raise InputError(f"{folder}: {len(failed)} of {len(clips)} clips are outside their bounds: {', '.join(failed)}")
+        raise InputError(
+            f"{folder}: {len(failed)} of {len(clips)} clips are no motion of {robot.name}: {', '.join(failed)}"
+        )
 
 
 def show(robot: Robot, options: Show) -> None:

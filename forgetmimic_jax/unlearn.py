@@ -15,11 +15,15 @@ def main(options: Options) -> None:
     from forgetmimic_jax.basics.provenance import provenance
     from forgetmimic_jax.evaluation.evaluate import evaluate, show_and_write
     from forgetmimic_jax.tracking.setup import make_setup
+    from forgetmimic_jax.tracking.stand import STAND
     from forgetmimic_jax.training import checkpoint
     from forgetmimic_jax.training.comparison import subject
+    from forgetmimic_jax.training.course import Plain
     from forgetmimic_jax.training.folder import default_folder, prepare_folder
     from forgetmimic_jax.training.run import interrupted, run
+    from forgetmimic_jax.training.standing import standing_teacher
     from forgetmimic_jax.training.start import base_checkpoint, base_policy
+    from forgetmimic_jax.training.stopping import Stopping
     from forgetmimic_jax.unlearning.registry import method_of
 
     at_least(1, "--episodes", options.episodes)
@@ -38,7 +42,12 @@ def main(options: Options) -> None:
         description = "fine-tune on all clips"  # which is no forgetting
     else:
         description = f"forget {', '.join(config.unlearn.targets)} by {config.unlearn.method}"
-    path, state = run(setup, output, description=description, resume=options.resume)
+    if config.unlearn.instead == STAND:
+        setup = dataclasses.replace(setup, teacher=standing_teacher(setup, output))
+    elif config.unlearn.instead is not None:
+        setup = dataclasses.replace(setup, teacher=base)
+    course = Stopping if config.unlearn.stop_every else Plain
+    path, state = run(setup, output, description=description, resume=options.resume, make_course=course)
     try:
         document = evaluate(
             setup,

@@ -97,7 +97,10 @@ def processor() -> str:
 
 
 def cores() -> int:
-    """How many cores this process may use."""
+    """How many cores this process may use; `PYTHON_CPU_COUNT` sets it, as Python itself does from 3.13 on."""
+    given = os.environ.get("PYTHON_CPU_COUNT", "")
+    if given.isdigit() and int(given):
+        return int(given)
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

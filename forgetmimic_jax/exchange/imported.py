@@ -26,15 +26,16 @@ class ImportedActor:
     """An ELU perceptron: action = W_n elu(… elu(W_1 (observation - mean) / scale + b_1) …) + b_n."""
 
     layers: tuple[tuple[np.ndarray, np.ndarray], ...]  # kernel f32[in, out], bias f32[out]
-    mean: np.ndarray | None = None  # f32[features]; None: observations are taken as they are
-    scale: np.ndarray | None = None  # f32[features]
+    mean: np.ndarray | None = None  # f32[features]; None: nothing is subtracted
+    scale: np.ndarray | None = None  # f32[features]; None: nothing is divided
     count: float = UNKNOWN_COUNT  # observations behind mean and scale
     std: np.ndarray | None = None  # f32[joint] exploration noise, if the file has it
     iteration: int = 0  # of the training it comes from
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """Mean action f32[n, joint] at observations f32[n, features]."""
-        x = observation if self.mean is None else (observation - self.mean) / self.scale
+        x = observation if self.mean is None else observation - self.mean
+        x = x if self.scale is None else x / self.scale
         for kernel, bias in self.layers[:-1]:
             x = x @ kernel + bias
             x = np.where(x > 0.0, x, np.expm1(np.minimum(x, 0.0)))
@@ -44,6 +45,26 @@ class ImportedActor:
     @property
     def hidden_layers(self) -> tuple[int, ...]:
         return tuple(kernel.shape[1] for kernel, _ in self.layers[:-1])
+
+
+def behind(actor: ImportedActor, factor: np.ndarray, shift: np.ndarray) -> ImportedActor:
+    """The actor that does at x what `actor` does at factor · (x + shift); exact, for both are linear.
+
+    Args:
+        actor: of factor · (x + shift).
+        factor: f[features], none of them 0.
+        shift: f[features].
+    """
+    mean, scale, layers = actor.mean, actor.scale, actor.layers
+    if shift.any() or mean is not None:
+        mean = ((0.0 if mean is None else mean) / factor - shift).astype(np.float32)
+    if (factor != 1.0).any():
+        if scale is not None:
+            scale = (scale / factor).astype(np.float32)
+        else:
+            (kernel, bias), *others = layers
+            layers = (((kernel * factor[:, None]).astype(np.float32), bias), *others)
+    return dataclasses.replace(actor, layers=layers, mean=mean, scale=scale)
 
 
 def check_actor(actor: ImportedActor, layout: Layout, robot: Robot, path: Path) -> None:
@@ -132,7 +153,7 @@ def within_limit(policy: Policy, observations: np.ndarray) -> np.ndarray:
 def notes(actor: ImportedActor, std: float) -> Sequence[str]:
     """What a user should know of an import, in sentences."""
     found = ["The critic starts fresh: its observations here are others than any other project's."]
-    if actor.mean is None:
+    if actor.scale is None:
         found.append("The file has no observation normaliser; observations go in as they are.")
     if actor.std is None:
         found.append(f"The file has no exploration noise; fine-tuning starts from a standard deviation of {std:g}.")

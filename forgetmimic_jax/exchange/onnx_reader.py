@@ -1,25 +1,27 @@
-"""An ONNX actor as plain arrays: normaliser, linear layers, ELU. What else a file holds, a motion, is not read."""
+"""An ONNX file as plain arrays: the actor (normaliser, linear layers, ELU), its metadata, and the clip inside."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import onnx
 from google.protobuf.message import DecodeError
 from onnx import numpy_helper
+from onnx.external_data_helper import load_external_data_for_model
 from onnx.reference import ReferenceEvaluator
 
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.exchange.imported import ImportedActor
-from forgetmimic_jax.exchange.onnx_actor import INPUT, OUTPUT, metadata
+from forgetmimic_jax.exchange.onnx_actor import INPUT, OUTPUT
 from forgetmimic_jax.policy.normalizer import OBSERVATION_LIMIT
-from forgetmimic_jax.robot.model import Robot
-from forgetmimic_jax.settings.config import Config
+from forgetmimic_jax.tracking.layouts import UNSUPPORTED
 
-METADATA_TOLERANCE = 2e-3  # mjlab writes three decimals
-
+TIME_STEP = "time_step"  # mjlab's second input: the frame of the clip inside
+CLIP = ("joint_pos", "joint_vel", "body_pos_w", "body_quat_w", "body_lin_vel_w", "body_ang_vel_w")  # its outputs
+HUMANOIDVERSE = "actor_obs"  # the input of its exports
 
 # What an operation with a constant c makes of z = scale · observation + shift.
 _AFFINE: dict[str, Callable] = {
@@ -30,25 +32,53 @@ _AFFINE: dict[str, Callable] = {
 }
 
 
-def read_onnx(path: Path, robot: Robot, config: Config) -> ImportedActor:
-    """The actor of an ONNX file: the chain of operations from the input `obs` to the output `actions`.
+@dataclass(frozen=True)
+class OnnxContent:
+    """What an ONNX file holds: the actor, its metadata, and the clip that it looks up by `time_step`."""
 
-    Args:
-        path: the file.
-        robot: that the policy must be for.
-        config: with the layout that the policy must see.
+    actor: ImportedActor
+    metadata: dict[str, str]
+    clip: dict[str, np.ndarray]  # [frame, ...] by the name of the output; empty without a clip
+
+
+def read_onnx(path: Path) -> OnnxContent:
+    """The chain of operations from the input `obs` to the output `actions`, and what the file says of itself.
 
     Raises:
-        InputError: not a model, other operations, or metadata that tell of another robot or observation.
+        InputError: not a model, a missing file of weights, other inputs or other operations.
     """
+    model = _load(path)
+    chain = _Chain(model.graph, path)
+    metadata = {entry.key: entry.value for entry in model.metadata_props}
+    return OnnxContent(_actor(chain, path), metadata, chain.tables(CLIP))
+
+
+def _load(path: Path) -> onnx.ModelProto:
     try:
-        model = onnx.load(path)
+        model = onnx.load(path, load_external_data=False)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except (DecodeError, onnx.checker.ValidationError, ValueError) as error:
         raise InputError(f"{path}: not a readable ONNX model: {str(error).splitlines()[0]}") from None
-    _check_metadata({entry.key: entry.value for entry in model.metadata_props}, robot, config, path)
-    chain = _Chain(model.graph, path)
+    weights = {
+        entry.value
+        for tensor in model.graph.initializer
+        if tensor.data_location == onnx.TensorProto.EXTERNAL
+        for entry in tensor.external_data
+        if entry.key == "location"
+    }
+    for name in sorted(weights):
+        if not (path.parent / name).is_file():
+            raise InputError(f"{path}: its weights are in {name}, and there is no such file beside it")
+    try:
+        load_external_data_for_model(model, str(path.parent))
+    except (onnx.checker.ValidationError, ValueError, OSError) as error:
+        raise InputError(f"{path}: weights in {', '.join(sorted(weights))}: {str(error).splitlines()[0]}") from None
+    return model
+
+
+def _actor(chain: _Chain, path: Path) -> ImportedActor:
+    """The actor that a chain of operations computes."""
     scale, shift = np.ones(1), np.zeros(1)
     layers: list[tuple[np.ndarray, np.ndarray]] = []
     linear = False  # whether the last operation was a linear layer
@@ -90,10 +120,30 @@ class _Chain:
         self._path = path
         self._constants = {tensor.name: numpy_helper.to_array(tensor) for tensor in graph.initializer}
         self._producers = {name: node for node in graph.node for name in node.output}
-        inputs, outputs = ([value.name for value in values] for values in (graph.input, graph.output))
-        for what, found, needed in (("inputs", inputs, INPUT), ("outputs", outputs, OUTPUT)):
-            if needed not in found:
-                raise InputError(f"{path}: {what}: found {', '.join(found) or 'none'}; '{needed}' is needed")
+        inputs = [value.name for value in graph.input if value.name not in self._constants]
+        outputs = [value.name for value in graph.output]
+        if HUMANOIDVERSE in inputs:
+            raise InputError(f"{path}: inputs: found {', '.join(inputs)}: HumanoidVerse's layouts are not supported: "
+                             f"they need {UNSUPPORTED['humanoidverse']}")  # fmt: skip
+        unknown = [name for name in inputs if name not in (INPUT, TIME_STEP)]
+        if INPUT not in inputs or unknown:
+            raise InputError(f"{path}: inputs: found {', '.join(inputs) or 'none'}; '{INPUT}' is needed, and no other "
+                             f"is accepted but mjlab's '{TIME_STEP}'")  # fmt: skip
+        if OUTPUT not in outputs:
+            raise InputError(f"{path}: outputs: found {', '.join(outputs) or 'none'}; '{OUTPUT}' is needed")
+        self._outputs = outputs
+
+    def tables(self, names: Sequence[str]) -> dict[str, np.ndarray]:
+        """The constant tables [row, ...] that outputs of these names are rows of; initialisers or Constants."""
+        found = {}
+        for name in names:
+            node = self._producers.get(name) if name in self._outputs else None
+            while node is not None and node.op_type in ("Identity", "Cast", "Squeeze", "Unsqueeze", "Reshape"):
+                node = self._producers.get(node.input[0])
+            table = self._constant(node.input[0]) if node is not None and node.op_type == "Gather" else None
+            if table is not None:
+                found[name] = table
+        return found
 
     def steps(self) -> list[tuple[onnx.NodeProto, list[np.ndarray]]]:
         """Each operation with its constants, from the input on."""
@@ -134,40 +184,3 @@ def _linear(node: onnx.NodeProto, constants: list[np.ndarray]) -> tuple[np.ndarr
 
 def _attribute(node: onnx.NodeProto, name: str, default: float) -> float:
     return next((onnx.helper.get_attribute_value(each) for each in node.attribute if each.name == name), default)
-
-
-def _check_metadata(found: dict[str, str], robot: Robot, config: Config, path: Path) -> None:
-    """What the file says of its robot must be so here. A file may say nothing."""
-    for key, here in metadata(robot, config, run_path="").items():
-        there = found.get(key, here)
-        if key in ("joint_names", "observation_names", "anchor_body_name", "action_mode") and there != here:
-            raise InputError(f"{path}: {key}: {_difference(there.split(','), here.split(','))}")
-        if key in ("joint_stiffness", "joint_damping", "default_joint_pos", "action_scale"):
-            _check_numbers(key, there, here, robot, path)
-
-
-def _difference(there: list[str], here: list[str]) -> str:
-    """The first place where two lists differ."""
-    if len(there) != len(here):
-        return f"found {len(there)}; {len(here)} are needed: {', '.join(here)}"
-    place = next(i for i, (one, other) in enumerate(zip(there, here, strict=True)) if one != other)
-    where = f" at place {place}" if len(here) > 1 else ""
-    return f"found '{there[place]}'{where}; '{here[place]}' is needed"
-
-
-def _check_numbers(key: str, there: str, here: str, robot: Robot, path: Path) -> None:
-    try:
-        found = np.array([float(item) for item in there.split(",")])
-    except ValueError:
-        raise InputError(f"{path}: {key}: found '{there[:40]}'; numbers are needed") from None
-    needed = np.array([float(item) for item in here.split(",")])
-    if found.size == 1:  # mjlab's scale, where it is the same for all
-        found = np.full(needed.size, found[0])
-    if found.size != needed.size:
-        raise InputError(f"{path}: {key}: found {found.size} numbers; {needed.size} are needed")
-    joint = int(np.argmax(np.abs(found - needed)))
-    if not abs(found[joint] - needed[joint]) <= METADATA_TOLERANCE:
-        raise InputError(
-            f"{path}: {key}: {robot.policy_joint_names[joint]}: found {found[joint]:.4g}; {robot.name} here has "
-            f"{needed[joint]:.4g}: a policy works with the gains and scales it was trained with"
-        )

@@ -21,7 +21,7 @@ import yaml
 
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.exchange.imported import UNKNOWN_COUNT, ImportedActor
-from forgetmimic_jax.motion.readers import NumbersOnly, Refused
+from forgetmimic_jax.motion.unpickle import NumbersOnly, Refused
 
 EPSILON = 0.01  # of EmpiricalNormalization
 ACTIVATION = "elu"

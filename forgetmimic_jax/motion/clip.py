@@ -39,8 +39,11 @@ class Clip:
         return self.num_frames / self.fps
 
 
-def validated(clip: Clip, source: str) -> Clip:
-    """The clip with unit quaternions on one continuous branch, or an InputError that names `source` and the field."""
+def validated(clip: Clip, source: str, first: int = 0) -> Clip:
+    """The clip with unit quaternions on one continuous branch, or an InputError that names `source` and the field.
+
+    `first` is the source's frame that the clip begins with.
+    """
     frames = len(clip.root_pos)
     if not np.isfinite(clip.fps) or clip.fps <= 0:
         raise InputError(f"{source}: fps: found {clip.fps}; a positive number of frames per second is needed")
@@ -50,14 +53,20 @@ def validated(clip: Clip, source: str) -> Clip:
         if value.shape != shape:
             raise InputError(f"{source}: {field}: found shape {list(value.shape)}; {list(shape)} is needed")
         if not np.isfinite(value).all():
-            frame = int(np.argwhere(~np.isfinite(value))[0][0])
-            raise InputError(f"{source}: {field}: NaN or infinity in frame {frame}; every number must be finite")
+            frame = first + int(np.argwhere(~np.isfinite(value))[0][0])
+            raise InputError(
+                f"{source}: {field}: NaN or infinity in frame {frame} ({frame / clip.fps:.2f} s); every number must be "
+                "finite"
+            )
     if frames < 2:
         raise InputError(f"{source}: found {frames} frame(s); a clip needs at least 2")
     norm = np.linalg.norm(clip.root_quat, axis=-1)
     if (np.abs(norm - 1.0) > 0.05).any():
         frame = int(np.argmax(np.abs(norm - 1.0)))
-        raise InputError(f"{source}: root_quat: norm {norm[frame]:.3g} in frame {frame}; unit quaternions are needed")
+        raise InputError(
+            f"{source}: root_quat: norm {norm[frame]:.3g} in frame {first + frame} ({(first + frame) / clip.fps:.2f} "
+            "s); unit quaternions are needed"
+        )
     quat = continuous(clip.root_quat / norm[:, None])
     return Clip(clip.name, float(clip.fps), tuple(clip.joint_names), clip.root_pos, quat, clip.joint_pos)
 

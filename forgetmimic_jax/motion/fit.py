@@ -1,10 +1,11 @@
-"""Fit a clip that was read to the robot and the library: the part wanted, the rate, the limits, the floor."""
+"""Fit a clip that was read to the robot and the library: the rate, the limits, the ground."""
 
 from __future__ import annotations
 
 import dataclasses
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.motion.clip import Clip
@@ -13,40 +14,47 @@ from forgetmimic_jax.motion.kinematics import configuration, resample
 from forgetmimic_jax.robot.model import Robot
 
 MAX_SINK = 0.015  # m
+MAX_SHIFT = 0.3  # m: a clip further from the ground was recorded for something else
+LASTING = 0.2  # s: shorter dips are slips, and move nothing
+GROUND = 0.05  # m: a robot whose lowest point stays higher never touches
 
 
-def fit(robot: Robot, clip: Clip, fps: float, start: float = 0.0, end: float | None = None) -> Clip:
-    """The clip from `start` to `end` in s, at `fps`, with its joints inside the robot's limits."""
-    clip = resample(trimmed(clip, start, end), fps)
+def fit(robot: Robot, clip: Clip, fps: float) -> Clip:
+    """The clip at `fps`, with its joints inside the robot's limits."""
+    clip = resample(clip, fps)
     return dataclasses.replace(clip, joint_pos=np.clip(clip.joint_pos, robot.joint_lower, robot.joint_upper))
 
 
-def trimmed(clip: Clip, start: float, end: float | None) -> Clip:
-    """The frames from `start` to `end` in s.
-
-    Raises:
-        InputError: fewer than two frames lie between.
-    """
-    last = (clip.num_frames - 1) / clip.fps
-    end = last if end is None else end
-    first, stop = int(np.ceil(start * clip.fps - 1e-6)), int(np.floor(end * clip.fps + 1e-6)) + 1
-    if not 0 <= first < stop - 1 or stop > clip.num_frames:
-        raise InputError(
-            f"{clip.name}: --start {start:g} --end {end:g}: two frames or more between 0 and {last:.2f} s are needed"
-        )
-    kept = slice(first, stop)
-    return dataclasses.replace(
-        clip, root_pos=clip.root_pos[kept], root_quat=clip.root_quat[kept], joint_pos=clip.joint_pos[kept]
-    )
+def lowest_points(robot: Robot, clip: Clip, soles: bool = False) -> np.ndarray:
+    """Height [frame] m of the robot's lowest point, or of its soles'."""
+    points = floor_points(robot)
+    heights = floor_positions(robot, points, configuration(clip, robot))[..., 2]
+    return heights[:, points.is_sole].min(axis=1) if soles else heights.min(axis=1)
 
 
 def on_floor(robot: Robot, clip: Clip) -> tuple[Clip, float]:
-    """The clip raised or lowered to stand on the floor, and by how much in m.
+    """The clip raised or lowered to stand on the ground, and by how much in m.
 
-    The lowest fifth of the frames' lowest sole points decides, not the single lowest, which is often a recording's
-    slip; that one may then lie up to MAX_SINK under the floor.
+    The lowest fifth of the frames' lowest sole points decides, and what lies lower for LASTING: no single frame, which
+    is often a recording's slip. The lowest that lasts may then lie up to MAX_SINK under the ground.
+
+    Raises:
+        InputError: more than MAX_SHIFT.
     """
-    points = floor_points(robot)
-    lowest = floor_positions(robot, points, configuration(clip, robot))[:, points.is_sole, 2].min(axis=1)
-    raised = -min(float(np.quantile(lowest, 0.2)), float(lowest.min()) + MAX_SINK)
+    lowest = lowest_points(robot, clip, soles=True)
+    lasting = median_filter(lowest, 2 * round(0.5 * LASTING * clip.fps) + 1, mode="nearest")
+    raised = -min(float(np.quantile(lowest, 0.2)), float(lasting.min()) + MAX_SINK)
+    if abs(raised) > MAX_SHIFT:
+        raise InputError(
+            f"{clip.name}: the soles are {-raised:.2f} m from the ground; at most {MAX_SHIFT} m are shifted. Is the "
+            "height another robot's, or in another unit (--unit)?"
+        )
     return dataclasses.replace(clip, root_pos=clip.root_pos + np.array([0.0, 0.0, raised])), raised
+
+
+def check_touches(clip: Clip, lowest: np.ndarray) -> None:
+    """Refuse a robot that never touches the ground; `lowest` [frame] m are the heights of its lowest points."""
+    if lowest.min() > GROUND:
+        raise InputError(
+            f"{clip.name}: the robot never touches the ground: its lowest point is {lowest.min():.2f} m above"
+        )

@@ -71,9 +71,10 @@ def build_library(robot: Robot, clips: Sequence[Clip], fps: float = 50.0) -> Mot
     lengths = [len(row.joint_pos) for row in rows]
 
     def padded(*values: np.ndarray) -> Array:
-        missing = [[(0, max(lengths) - len(value))] + [(0, 0)] * (value.ndim - 1) for value in values]
-        stacked = [np.pad(value, width, mode="edge") for value, width in zip(values, missing, strict=True)]
-        return jnp.asarray(np.stack(stacked), jnp.float32)
+        stacked = np.empty((len(values), max(lengths), *values[0].shape[1:]), np.float32)
+        for row, value in zip(stacked, values, strict=True):
+            row[: len(value)], row[len(value) :] = value, value[-1]
+        return jnp.asarray(stacked)
 
     return MotionLibrary(
         frames=jax.tree.map(padded, *rows),
@@ -97,6 +98,17 @@ def load_library(
         InputError: no or empty library, another robot's, an unknown clip, or a file that differs from its hash.
     """
     return build_library(robot, read_library(robot, path, clips), fps)
+
+
+def only_clips(library: MotionLibrary, names: Sequence[str]) -> MotionLibrary:
+    """The clips called `names`, in this order, without the frames that only longer clips have."""
+    chosen = np.array([library.names.index(name) for name in names])
+    frames = int(np.asarray(library.length)[chosen].max())
+    return MotionLibrary(
+        frames=jax.tree.map(lambda values: values[chosen, :frames], library.frames),
+        length=library.length[chosen],
+        names=tuple(names),
+    )
 
 
 def read_library(robot: Robot, path: Path | None = None, clips: Sequence[str] | None = None) -> list[Clip]:

@@ -19,6 +19,7 @@ class Column(NamedTuple):
 
 COLUMNS = {
     "seconds": Column("length", "s", "{:.2f}"),
+    "root_speed": Column("root", "m/s", "{:.2f}"),
     "sole_lowest": Column("sole min", "cm", "{:.1f}", 100.0),
     "stance_height": Column("stance", "cm", "{:.1f}", 100.0),
     "skate": Column("skate", "m/s", "{:.2f}"),
@@ -35,7 +36,7 @@ COLUMNS = {
 
 
 def quality_table(measures: Sequence[Quality], entries: Mapping[str, Any]) -> str:
-    """One line a clip, then what is outside its bounds, one a line.
+    """One line a clip, then what is no motion of the robot, and what is rougher than the shipped clips, one a line.
 
     A retargeted clip's mean angle to the human's limbs, from its entry of the manifest, is the last column.
     """
@@ -51,7 +52,11 @@ def quality_table(measures: Sequence[Quality], entries: Mapping[str, Any]) -> st
         f"{name:<{width}}" + "".join(f"{cell:>9}" for cell in cells) + (f"{angle:>7}" if shown else "")
         for name, cells, angle in rows
     ]
-    return "\n".join(lines + [f"{quality.name}: {failure}" for quality in measures for failure in quality.failures()])
+    lines += [f"fault: {quality.name}: {fault}" for quality in measures for fault in quality.faults()]
+    rough = [f"note: {quality.name}: {failure}" for quality in measures for failure in quality.failures()]
+    if rough:
+        lines += ["", "Rougher than the shipped clips, which may be no harm:", *rough]
+    return "\n".join(lines)
 
 
 def _cells(quality: Quality) -> list[str]:

@@ -12,6 +12,7 @@ import mujoco.batch
 import numpy as np
 from jax import Array
 
+from forgetmimic_jax.basics.provenance import cores
 from forgetmimic_jax.physics.engine import (
     BodyState,
     PhysicsParameters,
@@ -37,7 +38,7 @@ class NativeEngine:
         # A diverged simulation must show as NaN, to be counted; MuJoCo's own reset would hide it.
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         mujoco.set_mju_user_warning(lambda message: None)
-        self._batch = mujoco.batch.Batch(model, num_envs, num_threads)
+        self._batch = mujoco.batch.Batch(model, num_envs, num_threads or cores())
         self._lock = threading.Lock()
         self._substeps = substeps
         self._keys = robot.key_body_ids

@@ -52,6 +52,7 @@ def collect(env: Environment, assets: Assets, state: TrainState, rule: Rule) -> 
             log_prob=log_prob(action, mean, log_std),
             mean=mean,
             clip=before.clip,
+            taught=rule.teach(env, assets, before) if rule.teach else None,
         )
         outcome = Outcome(
             reward=reward * env.control_step,

@@ -16,6 +16,7 @@ class Transition:
     log_prob: Array  # of the action when it was taken
     mean: Array  # mean action of the policy that took it
     clip: Array  # i32 the motion that the step tracked
+    taught: Array | None = None  # the teacher's action, where the rule has a teacher
 
 
 @struct.dataclass

@@ -122,7 +122,8 @@ def improve(run: Config, focus: Focus, state: TrainState, batch: Batch, rule: Ru
             learning_rate = adapt(learning_rate, metrics["kl"])
         metrics["gradient_norm"] = optax.tree.norm(gradient)
         updates, optimizer_state = optimizer.update(gradient, optimizer_state)
-        actor, critic = jax.tree.map(lambda p, u: p - learning_rate * u, parameters, updates)
+        step = learning_rate if focus.settle is None else focus.settle * learning_rate
+        actor, critic = jax.tree.map(lambda p, u: p - step * u, parameters, updates)
         return ((bound_std(actor), critic), optimizer_state, learning_rate), metrics
 
     def epoch(carry, key: Array):

@@ -11,6 +11,7 @@ import mujoco
 from forgetmimic_jax.basics.errors import nearest
 from forgetmimic_jax.robot.sides import body_ids, side_problems
 
+HINGE = mujoco.mjtJoint.mjJNT_HINGE
 FLOOR = "floor"  # the name of the ground's geom
 
 
@@ -21,16 +22,17 @@ def misfits(roles: Mapping[str, Any], model: mujoco.MjModel) -> Iterator[str]:
         roles: the fields of the YAML that could be read, as `Roles` holds them.
         model: the MJCF, compiled.
     """
-    hinges = model.jnt_type[1:] == mujoco.mjtJoint.mjJNT_HINGE
-    if model.njnt < 2 or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE or not hinges.all():
-        yield f"model: {roles['model']} must have one free joint first and hinge joints only"
+    if model.njnt < 2 or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
+        yield f"model: {roles['model']} must have one free joint first, and hinge joints"
         return
-    if FLOOR not in [model.geom(geom).name for geom in range(model.ngeom)]:
-        yield f"model: {roles['model']} has no geom '{FLOOR}'"
+    others = [model.joint(joint).name for joint in range(1, model.njnt) if model.jnt_type[joint] != HINGE]
+    if others:
+        yield f"model: joint {_quoted(others)} is no hinge; mend: hinges in its place, or weld it (fixed: [its name])"
+        return
     joints = [model.joint(joint).name for joint in range(1, model.njnt)]
     endless = [joint for joint, limited in zip(joints, model.jnt_limited[1:], strict=True) if not limited]
     if endless:
-        yield f"model: no range of joint {_quoted(endless)}"
+        yield f"model: no range of joint {_quoted(endless)}; mend: ranges: {{{endless[0]}: [lower, upper]}} in rad"
     yield from _bodies(roles, model)
     yield from _head(roles, model)
     yield from _joints(roles, joints)
@@ -76,6 +78,10 @@ def _joints(roles: Mapping[str, Any], joints: list[str]) -> Iterator[str]:
     for pattern in roles.get("ignored_motors", ()):
         if not any(re.fullmatch(pattern, joint) for joint in joints):
             yield f"ignored_motors: no joint matches '{pattern}'"
+    for count, patterns in roles.get("variants", {}).items():
+        left = [joint for joint in joints if not any(re.fullmatch(pattern, joint) for pattern in patterns)]
+        if len(left) != count:
+            yield f"variants: {count}: {len(left)} joints match none of its patterns; {count} are needed"
     if "joint_motors" not in roles:
         return
     if "motors" in roles:

@@ -6,7 +6,8 @@ Every order (joints, bodies) is the model's own, looked up by name, never by pos
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from forgetmimic_jax.basics.places import shipped
 from forgetmimic_jax.robot.check import FLOOR
 from forgetmimic_jax.robot.roles import Roles, read_roles
 from forgetmimic_jax.robot.sides import Pairs, body_ids, counterparts, sides_of_bodies
+from forgetmimic_jax.robot.vendor import read_mjcf
 from forgetmimic_jax.settings.config import ActionConfig, PhysicsConfig
 
 ROBOTS_DIR = shipped("robots")
@@ -59,6 +61,7 @@ class Robot:
     joint_upper: np.ndarray  # [joint] rad
     motor_counts: np.ndarray  # bool[joint]: the motor's load counts when a clip is judged
     counterpart: np.ndarray  # [joint] place of the other side's joint, or the joint's own
+    variants: Mapping[int, tuple[str, ...]]  # the joints that a variant of the robot lacks, by the number it has
     default_height: float  # root height of the default pose, m
     key_bodies: tuple[str, ...]
     key_body_ids: np.ndarray  # [key_body] rows of the model's bodies
@@ -174,13 +177,14 @@ def load_robot(
 
 
 def read_spec(name: str, robots_dir: Path = ROBOTS_DIR) -> mujoco.MjSpec:
-    """A robot's MJCF as it is in its folder, with the shapes that are only seen.
+    """A robot's MJCF, mended where it is a vendor's, with the shapes that are only seen.
 
     Raises:
         InputError: unknown robot, or roles that are wrong or do not fit the MJCF.
     """
     path = roles_file(name, robots_dir)
-    return mujoco.MjSpec.from_file(str(path.parent / read_roles(path).model))
+    roles = read_roles(path)
+    return read_mjcf(path.parent / roles.model, roles.additions)[0]
 
 
 def relative_height(model: mujoco.MjModel) -> float:
@@ -296,6 +300,10 @@ def _resolved(
         joint_upper=upper,
         motor_counts=np.array([roles.counts_motor_of(joint) for joint in joint_names]),
         counterpart=np.array([counterpart_ids.get(joint, joint) - 1 for joint in range(1, model.njnt)]),
+        variants={
+            count: tuple(joint for joint in joint_names if any(re.fullmatch(pattern, joint) for pattern in patterns))
+            for count, patterns in roles.variants.items()
+        },
         default_height=roles.default_height,
         key_bodies=key_bodies,
         key_body_ids=np.array([model.body(body).id for body in key_bodies]),

@@ -15,6 +15,7 @@ import yaml
 from forgetmimic_jax.basics.errors import InputError, nearest
 from forgetmimic_jax.robot.check import first_match, misfits
 from forgetmimic_jax.robot.sides import Pairs
+from forgetmimic_jax.robot.vendor import Additions, Unreadable, read_mjcf
 
 T = TypeVar("T")
 
@@ -46,6 +47,16 @@ class Roles:
     joint_motors: tuple[tuple[str, str], ...]  # (pattern, motor): the first pattern that matches gives the motor
     ignored_motors: tuple[str, ...]  # patterns of the joints whose motor load does not count
     default_pose: Mapping[str, float]  # rad; a joint that is not named is 0
+    # What a vendor's MJCF lacks; see `vendor.Additions`.
+    fixed: tuple[str, ...]
+    ranges: Mapping[str, tuple[float, float]]
+    spheres: tuple[tuple[str, float, float, float, float], ...]
+    variants: Mapping[int, tuple[str, ...]]  # patterns of the joints that a variant lacks, by the number it has
+
+    @property
+    def additions(self) -> Additions:
+        """What is added to the MJCF."""
+        return Additions(self.fixed, self.ranges, self.spheres)
 
     def motor_of(self, joint: str) -> Motor:
         """The motor of a joint."""
@@ -69,6 +80,7 @@ def read_roles(path: Path) -> Roles:
     if not isinstance(content, dict):
         raise InputError(f"{path}: found {content!r}; accepted: a table of {', '.join(FIELDS)}")
     problems = [f"unknown field '{name}'; {nearest(str(name), FIELDS)}" for name in content if name not in FIELDS]
+    content = {**OPTIONAL, **content}
     problems += [f"missing field '{name}'" for name in FIELDS if name not in content]
     values: dict[str, Any] = {}
     for name in FIELDS:
@@ -79,7 +91,7 @@ def read_roles(path: Path) -> Roles:
                 problems += [f"{name}: {line}" for line in wrong.args]
     if "model" in values:
         try:
-            problems += misfits(values, _model(path.parent / values["model"]))
+            problems += misfits(values, _model(path.parent / values["model"], values))
         except _Wrong as wrong:
             problems += [f"model: {line}" for line in wrong.args]
     if problems:
@@ -91,13 +103,17 @@ class _Wrong(Exception):
     """What is wrong with a field, a line an argument."""
 
 
-def _model(file: Path) -> mujoco.MjModel:
+def _model(file: Path, values: Mapping[str, Any]) -> mujoco.MjModel:
+    """The MJCF, mended and compiled."""
     if not file.is_file():
         raise _Wrong(f"no file '{file.name}'")
+    additions = {name: values[name] for name in ("fixed", "ranges", "spheres") if name in values}
     try:
-        return mujoco.MjModel.from_xml_path(str(file))
+        return read_mjcf(file, Additions(**additions))[0].compile()
+    except Unreadable as error:
+        raise _Wrong(str(error)) from None
     except ValueError as error:
-        raise _Wrong(f"{file.name} is no MJCF that MuJoCo reads: {' '.join(str(error).split())}") from None
+        raise _Wrong(f"{file.name}: {' '.join(str(error).split())}") from None
 
 
 def _name(value: Any) -> str:
@@ -131,6 +147,16 @@ def _pattern(value: Any) -> str:
     return value
 
 
+def _patterns(value: Any) -> tuple[str, ...]:
+    return tuple(_pattern(pattern) for pattern in _names(value))
+
+
+def _count(value: str) -> int:
+    if not value.isdigit():
+        raise _Wrong(f"found {value!r}; accepted: a number of joints")
+    return int(value)
+
+
 def _rules(value: Any) -> tuple[tuple[str, str], ...]:
     if not isinstance(value, list) or not all(isinstance(rule, list) and len(rule) == 2 for rule in value):
         raise _Wrong(f"found {value!r}; accepted: a list of [pattern, motor]")
@@ -141,6 +167,23 @@ def _number(value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise _Wrong(f"found {value!r}; accepted: a finite number")
     return float(value)
+
+
+def _limits(value: Any) -> tuple[float, float]:
+    if not isinstance(value, list) or len(value) != 2:
+        raise _Wrong(f"found {value!r}; accepted: [lower, upper] in rad")
+    lower, upper = map(_number, value)
+    if lower >= upper:
+        raise _Wrong(f"found {value!r}; accepted: the lower limit first")
+    return lower, upper
+
+
+def _spheres(value: Any) -> tuple[tuple[str, float, float, float, float], ...]:
+    if not isinstance(value, list) or not all(isinstance(sphere, list) and len(sphere) == 5 for sphere in value):
+        raise _Wrong(f"found {value!r}; accepted: a list of [body, x, y, z, radius], in m")
+    return tuple(
+        (_name(body), _number(x), _number(y), _number(z), _positive(radius)) for body, x, y, z, radius in value
+    )
 
 
 def _positive(value: Any) -> float:
@@ -193,6 +236,11 @@ FIELDS: Mapping[str, Callable[[Any], Any]] = {
     "default_height": _positive,
     "motors": lambda value: _table(value, lambda motor: _record(Motor, motor, _positive)),
     "joint_motors": _rules,
-    "ignored_motors": lambda value: tuple(_pattern(pattern) for pattern in _names(value)),
+    "ignored_motors": _patterns,
     "default_pose": lambda value: _table(value, _number),
+    "fixed": _patterns,
+    "ranges": lambda value: _table(value, _limits),
+    "spheres": _spheres,
+    "variants": lambda value: {_count(count): patterns for count, patterns in _table(value, _patterns).items()},
 }
+OPTIONAL: Mapping[str, Any] = {"fixed": [], "ranges": {}, "spheres": [], "variants": {}}

@@ -221,6 +221,8 @@ class UnlearnConfig:
     targets: tuple[str, ...] = ()
     method: str = "arft"  # a module of forgetmimic_jax.unlearning
     settings: dict[str, float] = field(default_factory=dict, hash=False)  # the method's own, such as λ of arft
+    instead: str | None = None  # what a method teaches in the place of the targets: stand, or a kept clip
+    stop_every: Period = 0  # iterations between two looks whether the targets are at the zero-action baseline; 0: none
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,9 @@ class Options:
     episodes: int = 20
     """Evaluation episodes a clip."""
     jobs: int = 2
-    """Trials at a time; each of them uses all cores of a CPU."""
+    """Trials at a time on this machine; they share its cores evenly. With a GPU: 1."""
+    cluster: str | None = None
+    """Address of a dask scheduler, such as tcp://host:8786, whose workers run the trials; see docs/cluster.md."""
     trials: Path = Path("runs/trials")
     """Folder of the trials, where every study finds the finished ones again."""
     mix_commits: bool = False
@@ -149,6 +151,7 @@ class Lab:
             "physics": options.physics,
             "library": options.library,
             "preset": "paper" if options.preset == "paper" else None,  # else the base's own settings
+            "no_stop": True,  # rows are compared at the same budget
         }
         together = [*itertools.chain(*options.set), *variant.get("set", [])]
         return make_trial(options.trials, {**conditions, **variant, "set": together})
@@ -170,7 +173,8 @@ class Lab:
         from forgetmimic_jax.studies.trials import run_trials
 
         missing = [trial for trial in trials.values() if self._finished(trial) is None]
-        failed = run_trials(missing, jobs=self.options.jobs, description=what) if missing else {}
+        jobs, cluster = self.options.jobs, self.options.cluster
+        failed = run_trials(missing, jobs=jobs, cluster=cluster, description=what) if missing else {}
         self.failed |= {trial.folder.name: reason for trial, reason in failed.items()}
         finished = self._folders(trials)
         if not finished and not others:
@@ -187,7 +191,7 @@ class Lab:
         """The folder of a trial that is finished, with --mix-commits also that of the same trial of other code."""
         from forgetmimic_jax.studies.trials import without_code
 
-        if trial.evaluation.is_file():
+        if trial.finished:
             return trial.folder
         others = sorted(self.options.trials.glob("*/evaluation.json")) if self.options.mix_commits else []
         alike = (path.parent for path in others if without_code(path.parent.name) == without_code(trial.folder.name))

@@ -25,5 +25,13 @@ def to_joint_target(mode: Literal["residual", "offset"], robot: RobotArrays, ref
         reference: the frame to reach next.
         action: [env, joint] in the robot's order.
     """
-    origin = reference.joint_pos if mode == "residual" else robot.default_joint_pos
-    return origin + robot.action_scale * action
+    return _origin(mode, robot, reference) + robot.action_scale * action
+
+
+def to_action(mode: Literal["residual", "offset"], robot: RobotArrays, reference: Frames, joint_target: Array) -> Array:
+    """The action [env, joint] that stands for joint targets [env, joint] rad: the inverse of `to_joint_target`."""
+    return (joint_target - _origin(mode, robot, reference)) / robot.action_scale
+
+
+def _origin(mode: Literal["residual", "offset"], robot: RobotArrays, reference: Frames) -> Array:
+    return reference.joint_pos if mode == "residual" else robot.default_joint_pos

@@ -29,6 +29,7 @@ from forgetmimic_jax.tracking.reference import align_to_anchor, anchor_between, 
 from forgetmimic_jax.tracking.reward import Pair
 from forgetmimic_jax.tracking.rsi import Bins, bin_probabilities, make_bins, sample_start
 from forgetmimic_jax.tracking.setup import Setup
+from forgetmimic_jax.tracking.stand import falls
 from forgetmimic_jax.tracking.termination import terminations
 from forgetmimic_jax.tracking.wrench import reference_wrench
 
@@ -43,6 +44,9 @@ class Assets:
     is_target: Array  # bool[clip] the clips to forget
     focus: Focus
     base: Policy | None = None  # the frozen policy that an unlearning run, or a phase of pretraining, compares with
+    teacher: Policy | None = None  # the policy that shows what to do instead of a target
+    instead: MotionLibrary | None = None  # its only clip is what to do instead of a target
+    starts: MotionLibrary | None = None  # frames that episodes start at, where they are not those to track
 
 
 @struct.dataclass
@@ -86,6 +90,7 @@ class Environment:
     engine: Engine  # simulates a control step at a time; with the wrench a physics step
     num_envs: int
     noisy: bool  # reset noise, pushes, randomisation and observation noise
+    runs_on: int = 0  # control steps that a target's episode lasts after the clip's end; with any, only a fall ends it
 
     @property
     def layout(self) -> Layout:
@@ -101,13 +106,22 @@ class Environment:
         return float(self.robot.model.geom_friction[self.robot.foot_geom_ids[0], 0])
 
 
-def make_environment(setup: Setup, num_envs: int, *, noisy: bool | None = None) -> Environment:
-    """An environment of `num_envs` robots; `noisy` defaults to the config's."""
+def make_environment(setup: Setup, num_envs: int, *, noisy: bool | None = None, runs_on: float = 0.0) -> Environment:
+    """An environment of `num_envs` robots.
+
+    Args:
+        setup: robot, clips and settings.
+        num_envs: robots.
+        noisy: by default the config's.
+        runs_on: s that an episode of a target clip lasts after the clip's end, with the last frame held. Above 0, such
+            an episode is terminated by a fall only.
+    """
     config, robot = setup.config, setup.robot
     assisted = config.wrench.max_gain > 0
     physics = dataclasses.replace(config.physics, substeps=1) if assisted else config.physics  # see `_simulate`
     engine = make_engine(robot, physics, num_envs)
-    return Environment(config, robot, engine, num_envs, config.noise.enabled if noisy is None else noisy)
+    noisy = config.noise.enabled if noisy is None else noisy
+    return Environment(config, robot, engine, num_envs, noisy, round(runs_on / config.physics.control_step))
 
 
 def make_assets(setup: Setup) -> Assets:
@@ -118,7 +132,7 @@ def make_assets(setup: Setup) -> Assets:
     if config.sampling.clips == "kept":
         bins = dataclasses.replace(bins, valid=bins.valid & ~is_target[:, None])
     focus = focus_of(config.ppo, is_target)
-    return Assets(setup.robot.arrays, library, bins, is_target, focus, setup.base)
+    return Assets(setup.robot.arrays, library, bins, is_target, focus, setup.base, setup.teacher, setup.instead)
 
 
 def start_probabilities(config: Config, assets: Assets, failure_level: Array) -> Array:
@@ -132,7 +146,10 @@ def start_episodes(
     """Fresh episodes [env] at the given clips and frames, with reset noise. Bodies: see `refresh_bodies`."""
     noise, n, joints = env.config.noise, env.num_envs, env.robot.num_joints
     keys = jax.random.split(key, 4)
-    reference = lookup(assets.library, clip, frame)
+    reference = lookup(assets.library if assets.starts is None else assets.starts, clip, frame)
+    left = assets.library.length[clip] - 1 - frame
+    if env.runs_on:
+        left += env.runs_on * assets.is_target[clip]
     if env.noisy:
         parameters = randomise.physics_parameters(noise, keys[1], n)
         encoder_bias = randomise.symmetric(keys[2], n, (noise.encoder_bias,) * joints)
@@ -147,7 +164,7 @@ def start_episodes(
         frame=frame,
         start_bin=start_bin,
         step=jnp.zeros((n,), jnp.int32),
-        horizon=jnp.minimum(env.config.max_episode_steps, assets.library.length[clip] - 1 - frame),
+        horizon=jnp.minimum(env.config.max_episode_steps, left),
         tracking_sum=jnp.zeros((n,), jnp.float32),
         last_action=jnp.zeros((n, joints), jnp.float32),
         encoder_bias=encoder_bias,
@@ -233,6 +250,10 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
         lambda value: jnp.where(diverged, 0.0, value), reward.Reward(tracking, regularisation, normalized, kernels)
     )
     causes = terminations(config.termination, reference, aligned, bodies, robot)
+    if env.runs_on:
+        is_target = assets.is_target[state.clip]
+        causes = {name: broken & ~is_target for name, broken in causes.items()}
+        causes["fall"] = is_target & falls(robot, state.bodies, bodies)
     terminated = diverged | jnp.stack(list(causes.values())).any(0)
     steps = state.step + 1
     new = dataclasses.replace(
@@ -272,18 +293,22 @@ def _simulate(env: Environment, assets: Assets, state: EnvState, joint_target: A
     return state.physics, state.bodies
 
 
-def observe(env: Environment, assets: Assets, state: EnvState, key: Array | None) -> tuple[Array, Array]:
-    """Actor observation [env, features] and critic observation [env, features]; noise on the actor's with a key."""
-    robot = env.robot
-    moment = Moment(
+def moment_of(env: Environment, assets: Assets, state: EnvState) -> Moment:
+    """What the observations of the running episodes are made of."""
+    return Moment(
         robot=assets.robot,
         reference=lookup(assets.library, state.clip, state.frame + 1),
         physics=state.physics,
         bodies=state.bodies,
         last_action=state.last_action,
-        anchor=robot.anchor,
-        root=robot.root,
+        anchor=env.robot.anchor,
+        root=env.robot.root,
     )
+
+
+def observe(env: Environment, assets: Assets, state: EnvState, key: Array | None) -> tuple[Array, Array]:
+    """Actor observation [env, features] and critic observation [env, features]; noise on the actor's with a key."""
+    robot, moment = env.robot, moment_of(env, assets, state)
     clean = observation.actor_observation(env.layout, robot.policy_joints, moment)
     wrench = assist(env, assets, state) if env.config.wrench.max_gain > 0 else jnp.zeros((env.num_envs, 6), jnp.float32)
     critic = observation.critic_observation(
@@ -291,7 +316,7 @@ def observe(env: Environment, assets: Assets, state: EnvState, key: Array | None
         moment,
         wrench=wrench / (assets.robot.mass * 9.81),
         wrench_gain=state.wrench_gain,
-        phase=state.frame / assets.library.length[state.clip],
+        phase=jnp.minimum(state.frame, assets.library.length[state.clip]) / assets.library.length[state.clip],
         terms=state.terms,
     )
     if key is None:

@@ -17,6 +17,7 @@ class Focus:
     base_kl: Array | None  # [clip] weight of KL(π ‖ π_base) on the clip's steps; None: no such term
     target_kl: Array  # [] KL of an iteration that an adaptive step size follows
     gae_lambda: Array  # [] λ of the advantages
+    settle: Array | None = None  # [] share of the step size that is taken; None: the whole
 
 
 def focus_of(config: PPOConfig, is_target: Array) -> Focus:

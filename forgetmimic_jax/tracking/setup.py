@@ -9,11 +9,19 @@ import jax
 
 from forgetmimic_jax.basics.errors import InputError, nearest
 from forgetmimic_jax.basics.places import cache_folder
-from forgetmimic_jax.motion.library import DATA_DIR, MotionLibrary, library_hash, load_library, read_manifest
+from forgetmimic_jax.motion.library import (
+    DATA_DIR,
+    MotionLibrary,
+    library_hash,
+    load_library,
+    only_clips,
+    read_manifest,
+)
 from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.robot.model import Robot, load_robot
 from forgetmimic_jax.settings.config import Config, validate
 from forgetmimic_jax.tracking.layouts import find_layout
+from forgetmimic_jax.tracking.stand import STAND, stand_library
 
 
 @dataclass(frozen=True)
@@ -25,6 +33,8 @@ class Setup:
     library: MotionLibrary
     library_hash: str
     base: Policy | None = None  # the frozen policy that an unlearning run starts from and compares with
+    teacher: Policy | None = None  # the policy that shows what to do instead of a target
+    instead: MotionLibrary | None = None  # its only clip is what to do instead of a target
 
 
 def make_setup(config: Config) -> Setup:
@@ -41,7 +51,8 @@ def make_setup(config: Config) -> Setup:
     folder = library_folder(config)
     library = load_library(robot, folder, fps=1.0 / config.physics.control_step)
     check_targets(config.unlearn.targets, library.names)
-    return Setup(config, robot, library, library_hash(folder))
+    instead = instead_of_targets(config, robot, library)
+    return Setup(config, robot, library, library_hash(folder), instead=instead)
 
 
 def library_folder(config: Config) -> Path:
@@ -52,6 +63,24 @@ def library_folder(config: Config) -> Path:
 def default_targets(config: Config) -> tuple[str, ...]:
     """The clips that the library itself proposes to forget."""
     return tuple(read_manifest(library_folder(config)).get("default_targets", ()))
+
+
+def instead_of_targets(config: Config, robot: Robot, library: MotionLibrary) -> MotionLibrary | None:
+    """A library of the one clip that the targets are replaced with (`unlearn.instead`); None where there is none.
+
+    Raises:
+        InputError: a clip that is not in the library, or one to forget.
+    """
+    name, targets = config.unlearn.instead, config.unlearn.targets
+    if name is None:
+        return None
+    if name == STAND:
+        return stand_library(robot, fps=1.0 / config.physics.control_step)
+    kept = [clip for clip in library.names if clip not in targets]
+    if name not in kept:
+        found = f"'{name}' is a clip to forget" if name in targets else f"no clip '{name}' in the library"
+        raise InputError(f"unlearn.instead: {found}; {nearest(name, [STAND, *kept])}")
+    return only_clips(library, [name])
 
 
 def check_targets(targets: tuple[str, ...], names: tuple[str, ...]) -> None:

@@ -56,3 +56,12 @@ def tilted(robot: Robot, bodies: Bodies) -> Array:
     quat = bodies.quat[:, robot.anchor]
     up = rotation.rotate(quat, jnp.zeros_like(bodies.pos[:, robot.anchor]).at[:, 2].set(1.0))
     return up[:, 2] < np.cos(FALL_TILT)
+
+
+def falls(robot: Robot, before: Bodies, after: Bodies) -> Array:
+    """bool[env]: the robot is low or tilted after a step, and was not so before it; arguments as in `fallen`.
+
+    So a robot that lies at the start of a clip of getting up does not fall, and one that leans in the middle of a kick
+    falls when it is low.
+    """
+    return (low(robot, after) & ~low(robot, before)) | (tilted(robot, after) & ~tilted(robot, before))

@@ -1,16 +1,16 @@
-"""What a run does at its evaluations: plain training takes notes, pretraining may change its phase."""
+"""What a run does after its iterations: plain training evaluates, pretraining may change its phase."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Protocol
 
 from rich.console import Console
 
 from forgetmimic_jax.ppo.state import TrainState
+from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking.env import Assets, Environment
 from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.training import checkpoint
@@ -31,7 +31,7 @@ class Position:
 
 
 class Course(Protocol):
-    """What a run does before its first iteration and at its evaluations."""
+    """What a run does before its first iteration and after each."""
 
     @property
     def command(self) -> str:
@@ -57,18 +57,21 @@ class Course(Protocol):
         """Before the first iteration, of a new run or of one that is resumed."""
         ...
 
-    def evaluated(self, position: Position) -> Position:
-        """At an evaluation; the run continues from the position that is returned."""
+    def after(self, position: Position) -> Position:
+        """After an iteration; the run continues from the position that is returned."""
         ...
 
 
 MakeCourse = Callable[[Setup, Environment, Path, Console, CheckpointInfo | None], Course]
 
 
+def evaluates(config: Config, iteration: int) -> bool:
+    """Whether a run is evaluated after its iteration `iteration`."""
+    return config.evaluate_every > 0 and iteration % config.evaluate_every == 0
+
+
 class Plain:
     """The same training all along; `best/` is the best policy on the clips to keep, of those evaluated."""
-
-    finished, curriculum, note = False, None, MappingProxyType[str, Any]({})
 
     def __init__(
         self, setup: Setup, env: Environment, directory: Path, console: Console, resumed: CheckpointInfo | None
@@ -77,12 +80,29 @@ class Plain:
         self._setup, self._directory, self._console = setup, directory, console
         self._watch: Watch | None = None
 
+    @property
+    def finished(self) -> bool:
+        return False
+
+    @property
+    def curriculum(self) -> Mapping[str, Any] | None:
+        return None
+
+    @property
+    def note(self) -> Mapping[str, Any]:
+        return {}
+
     def begin(self, position: Position) -> Position:
         if self._setup.config.evaluate_every:
             self._watch = Watch(self._setup, self._directory, position.iteration)
         return position
 
-    def evaluated(self, position: Position) -> Position:
+    def after(self, position: Position) -> Position:
+        if evaluates(self._setup.config, position.iteration):
+            self._evaluate(position)
+        return position
+
+    def _evaluate(self, position: Position) -> None:
         assert self._watch is not None
         state = position.state
         row = self._watch.measure(state.policy, position.iteration, position.environment_steps)
@@ -91,4 +111,3 @@ class Plain:
             progress = Progress(position.iteration, position.environment_steps, base)
             checkpoint.save_policy(self._directory / BEST, self._setup, state.policy, state.failure_level, progress)
         self._console.print(self._watch.table())
-        return position

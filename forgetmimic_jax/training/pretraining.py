@@ -28,7 +28,7 @@ from forgetmimic_jax.tracking.focus import Focus
 from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.training import checkpoint
 from forgetmimic_jax.training.checkpoint import CheckpointInfo, Progress, checkpoints
-from forgetmimic_jax.training.course import Position
+from forgetmimic_jax.training.course import Position, evaluates
 from forgetmimic_jax.training.curriculum import (
     ClipProgress,
     Curriculum,
@@ -87,7 +87,10 @@ class Pretraining:
         self._watch = Watch(self._setup, self._directory, position.iteration)
         return dataclasses.replace(position, assets=self._assets(position.state.policy))
 
-    def evaluated(self, position: Position) -> Position:
+    def after(self, position: Position) -> Position:
+        return self._evaluated(position) if evaluates(self._config, position.iteration) else position
+
+    def _evaluated(self, position: Position) -> Position:
         before = self._curriculum
         self._measure(position)
         if self._curriculum.stage != before.stage:

@@ -45,13 +45,14 @@ def run(
     config = setup.config
     base = unlearned_base(config)
     newest = prepare_folder(directory, resume=resume)
-    env, assets = make_environment(setup, config.ppo.num_envs), make_assets(setup)
+    method = method_of(config)
+    env, assets = make_environment(setup, config.ppo.num_envs, runs_on=method.runs_on), make_assets(setup)
     if newest is None:
         now = Position(start_state(setup, env, assets), assets, 0, steps_before(config))
     else:
         state, environment_steps = saved_state(setup, env, assets, newest)
         now = Position(state, assets, int(state.iteration), environment_steps)
-    iterate = make_iteration(env, method_of(config))
+    iterate = make_iteration(env, method)
     directory.mkdir(parents=True, exist_ok=True)
     console = Console()
     if newest and (difference := another_machine(newest)):
@@ -87,8 +88,7 @@ def run(
                 if now.iteration == 1 or now.iteration % LOG_EVERY == 0:
                     log.write(now.iteration, steps, setup.library.names, course.note)
                 report(now.iteration, steps, _live(metrics))
-                if config.evaluate_every and now.iteration % config.evaluate_every == 0:
-                    now = course.evaluated(now)
+                now = course.after(now)
                 if now.iteration % config.checkpoint_every == 0:
                     saved = save()  # after the evaluation, which a run that is resumed from here does not make again
             if int(saved.name) != now.iteration:

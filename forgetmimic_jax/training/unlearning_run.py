@@ -40,7 +40,8 @@ class Options:
     """Unlearning method, the name of a file of forgetmimic_jax/unlearning:
     arft (the paper's), distill, retrain, finetune,
     random_reward, negated_reward, gradient_ascent,
-    trajdeleter, poisoning, decremental or policy_edit."""
+    trajdeleter, poisoning, decremental, policy_edit,
+    or stand (the robot stands where a target is wanted)."""
     penalty: float | None = None
     """Penalty λ of arft on the targets' normalised tracking reward; 16 by default. The paper's threshold is W = 8."""
     sampler: Literal["uniform_clips", "uniform_bins", "frozen", "adaptive"] | None = None
@@ -52,8 +53,11 @@ class Options:
     preset: Preset | None = None
     """Settings of the fine-tuning; by default the base's own, at the default budget of a laptop."""
     iterations: int | None = None
-    """PPO iterations; 640 by default (1000 with --preset paper), distill: 200,
-    retrain: as many steps as the base was trained for."""
+    """PPO iterations; 640 by default (1000 with --preset paper), distill: 200, stand: 240,
+    retrain: as many steps as the base was trained for. With a stop rule the most of them."""
+    no_stop: bool = False
+    """Train all iterations. Without this flag arft, random_reward, negated_reward and gradient_ascent
+    end soon after the targets' skill has fallen to the zero-action baseline."""
     seed: int = 0
     """Random seed of the fine-tuning and of the evaluation."""
     base: Path | None = None
@@ -93,7 +97,8 @@ def config_of_new_run(options: Options) -> Config:
     targets = default_targets(config) if options.targets is None else comma_separated(options.targets)
     settings = {} if options.penalty is None else {"penalty": options.penalty}
     config = unlearning_config(config, UnlearnConfig(targets, options.method, settings))
-    pace = find_method(options.method).pace
+    method = find_method(options.method)
+    pace, stop_every = method.pace, 0 if options.no_stop else method.stop_every
     config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, **pace.ppo.get(config.preset, {})))
     sampling = replace_given(config.sampling, rule=options.sampler, clips=options.clips)
     if (sampling.rule, sampling.clips) == ("uniform_clips", "all"):  # the other samplers' shares are their own
@@ -107,7 +112,8 @@ def config_of_new_run(options: Options) -> Config:
         iterations = max(1, round(info.environment_steps / (config.ppo.num_envs * config.ppo.num_steps)))
     else:
         raise InputError(f"--iterations: {info.path} does not say how long it was trained; say how long to retrain")
-    return dataclasses.replace(config, iterations=iterations, sampling=sampling, wrench=wrench)
+    unlearn = dataclasses.replace(config.unlearn, stop_every=stop_every)
+    return dataclasses.replace(config, iterations=iterations, sampling=sampling, wrench=wrench, unlearn=unlearn)
 
 
 def _on_preset(base: Config, name: str) -> Config:
@@ -133,4 +139,6 @@ def _config_of_run(options: Options, output: Path) -> Config:
     check_same(options, {"targets": ",".join(unlearn.targets), "method": unlearn.method})
     check_same(options, {"penalty": unlearn.settings.get("penalty")})
     check_same(options, {"sampler": sampling.rule, "clips": sampling.clips, "wrench": config.wrench.max_gain > 0})
-    return config
+    return (
+        dataclasses.replace(config, unlearn=dataclasses.replace(unlearn, stop_every=0)) if options.no_stop else config
+    )

@@ -10,7 +10,7 @@ from jax import Array
 from forgetmimic_jax.ppo.rule import plain_reward
 from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking.reward import Reward
-from forgetmimic_jax.unlearning.method import Method
+from forgetmimic_jax.unlearning.method import STOP_EVERY, Method
 
 
 def anti_reward(config: Config, reward: Reward, is_target: Array, key: Array) -> Array:
@@ -19,4 +19,5 @@ def anti_reward(config: Config, reward: Reward, is_target: Array, key: Array) ->
     return plain_reward(config, reward, is_target, key) - penalty * reward.normalized_tracking * is_target
 
 
-METHOD = Method(reward=anti_reward, settings={"penalty": 16.0})  # λ; W = 8 is the edge of the paper's algebra
+# λ; W = 8 is the edge of the paper's algebra.
+METHOD = Method(reward=anti_reward, settings={"penalty": 16.0}, stop_every=STOP_EVERY)

@@ -14,7 +14,7 @@ from jax import Array
 
 from forgetmimic_jax.ppo.loss import Batch, Prediction, ppo_loss
 from forgetmimic_jax.settings.config import Config
-from forgetmimic_jax.unlearning.method import Method
+from forgetmimic_jax.unlearning.method import STOP_EVERY, Method
 
 
 def ascent(config: Config, batch: Batch, now: Prediction, iteration: Array) -> tuple[Array, dict[str, Array]]:
@@ -23,4 +23,4 @@ def ascent(config: Config, batch: Batch, now: Prediction, iteration: Array) -> t
     return ppo_loss(config, dataclasses.replace(batch, advantage=advantage), now)
 
 
-METHOD = Method(loss=ascent)
+METHOD = Method(loss=ascent, stop_every=STOP_EVERY)

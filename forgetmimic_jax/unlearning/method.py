@@ -38,6 +38,7 @@ SHORT: dict[str, Any] = {
     "equal_clips": True,
     "base_kl": 0.1,
 }
+STOP_EVERY = 20  # iterations, of the methods whose reward would push the targets below the zero-action baseline
 FINE_TUNING = Pace({"cpu": 640, "paper": 1000}, {"cpu": SHORT}, {"cpu": 0.5})
 
 
@@ -53,6 +54,9 @@ class Method(Rule):
         result: what evaluation.json calls the policy.
         settings: its own settings (`unlearn.settings`) and their defaults.
         pace: how long it trains and with which PPO settings.
+        instead: what it teaches in the place of the targets by default (`unlearn.instead`), where it teaches.
+        stop_every: iterations between two looks of the stop rule by default (`unlearn.stop_every`); 0: a method that
+            has no stop rule, because nothing in it pushes the targets below the zero-action baseline.
     """
 
     clips: Literal["all", "kept"] = "all"
@@ -60,3 +64,5 @@ class Method(Rule):
     result: Literal["unlearned", "retrained", "fine_tuned"] = "unlearned"
     settings: Mapping[str, float] = field(default_factory=dict)
     pace: Pace = FINE_TUNING
+    instead: str | None = None
+    stop_every: int = 0

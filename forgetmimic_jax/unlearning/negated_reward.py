@@ -12,7 +12,7 @@ from jax import Array
 from forgetmimic_jax.ppo.rule import plain_reward
 from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking.reward import Reward
-from forgetmimic_jax.unlearning.method import Method
+from forgetmimic_jax.unlearning.method import STOP_EVERY, Method
 
 
 def negated(config: Config, reward: Reward, is_target: Array, key: Array) -> Array:
@@ -20,4 +20,4 @@ def negated(config: Config, reward: Reward, is_target: Array, key: Array) -> Arr
     return -plain_reward(config, reward, is_target, key)
 
 
-METHOD = Method(reward=negated)
+METHOD = Method(reward=negated, stop_every=STOP_EVERY)

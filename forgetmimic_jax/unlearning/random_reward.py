@@ -14,7 +14,7 @@ from jax import Array
 from forgetmimic_jax.ppo.rule import plain_reward
 from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking.reward import Reward, total_tracking_weight
-from forgetmimic_jax.unlearning.method import Method
+from forgetmimic_jax.unlearning.method import STOP_EVERY, Method
 
 
 def random_on_targets(config: Config, reward: Reward, is_target: Array, key: Array) -> Array:
@@ -24,4 +24,4 @@ def random_on_targets(config: Config, reward: Reward, is_target: Array, key: Arr
     return jnp.where(is_target, noise, plain_reward(config, reward, is_target, key))
 
 
-METHOD = Method(reward=random_on_targets)
+METHOD = Method(reward=random_on_targets, stop_every=STOP_EVERY)

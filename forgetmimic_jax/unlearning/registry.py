@@ -50,7 +50,9 @@ def unlearning_config(base: Config, unlearn: UnlearnConfig) -> Config:
         InputError: an unknown method, or a setting that the method does not have.
     """
     method = _checked(unlearn)
-    unlearn = dataclasses.replace(unlearn, settings={**method.settings, **unlearn.settings})
+    unlearn = dataclasses.replace(
+        unlearn, settings={**method.settings, **unlearn.settings}, instead=unlearn.instead or method.instead
+    )
     sampling = dataclasses.replace(base.sampling, clips=method.clips, target_share=0.0)  # which a base may have had
     wrench = base.wrench
     if method.start != "fresh":
@@ -67,4 +69,13 @@ def _checked(unlearn: UnlearnConfig) -> Method:
             raise InputError(
                 f"unlearn.settings: {unlearn.method} has no setting '{name}'; {nearest(name, method.settings)}"
             )
+    if unlearn.instead is not None and method.instead is None:
+        raise InputError(
+            f"unlearn.instead: found {unlearn.instead}; accepted: nothing, since {unlearn.method} teaches nothing "
+            "in the place of the targets"
+        )
+    if unlearn.stop_every and not method.stop_every:
+        raise InputError(
+            f"unlearn.stop_every: found {unlearn.stop_every}; accepted: 0, since {unlearn.method} has no stop rule"
+        )
     return method

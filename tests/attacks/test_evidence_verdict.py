@@ -1,7 +1,7 @@
 """The verdict's rule on made-up evidence: what passes, and every reason that decides otherwise."""
 
 import pytest
-from invented import compared, curve, estimate, evidence, numbers
+from invented_evidence import compared, curve, estimate, evidence, numbers
 
 from forgetmimic_jax.attacks.verdict import RULES, judge
 from forgetmimic_jax.evaluation.verdict import CONSISTENT, FAILED, INCONCLUSIVE, RECOVERABLE

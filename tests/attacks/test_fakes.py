@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 import toy
-from invented import PLAIN
+from invented_evidence import PLAIN
 
 from forgetmimic_jax.attacks import case as cases
 from forgetmimic_jax.attacks import fakes, look_alikes, membership, near_duplicates, numerics, splices

@@ -2,7 +2,7 @@
 
 import msgspec
 import pytest
-from invented import estimate
+from invented_evidence import estimate
 
 from forgetmimic_jax.attacks.case import Scale
 from forgetmimic_jax.attacks.document import Curve, Numbers

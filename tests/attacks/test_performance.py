@@ -115,7 +115,7 @@ def test_with_several_seeds_the_seed_is_the_unit(measured):
 def test_a_part_of_a_document_is_written_as_it_is(tmp_path):
     write_document(tmp_path / "new" / "part.json", Numbers())
     assert (tmp_path / "new" / "part.json").read_text() == "{}\n"
-    from invented import evidence
+    from invented_evidence import evidence
 
     document = evidence()
     write_document(tmp_path / "evidence.json", document)

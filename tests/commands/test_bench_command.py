@@ -8,14 +8,14 @@ from forgetmimic_jax import bench
 from forgetmimic_jax.ppo import update
 from forgetmimic_jax.settings import config
 from forgetmimic_jax.settings.options import override
-from forgetmimic_jax.training import run
+from forgetmimic_jax.training import run, speed
 
 
 @pytest.fixture
 def tiny(monkeypatch):
     preset = config.preset
     monkeypatch.setattr(config, "preset", lambda name: override(preset(name), TINY))
-    monkeypatch.setattr(update, "make_iteration", run.make_iteration)  # which other tests have compiled
+    monkeypatch.setattr(speed, "make_iteration", run.make_iteration)  # which other tests have compiled
 
 
 def test_every_part_of_an_iteration_is_timed(tiny, tmp_path, library_folder):
@@ -29,10 +29,46 @@ def test_every_part_of_an_iteration_is_timed(tiny, tmp_path, library_folder):
     assert sum(shares) == pytest.approx(1.0)
 
 
+def test_memory_is_computed_without_a_simulation(tiny, monkeypatch, tmp_path, library_folder):
+    monkeypatch.setattr(speed, "make_iteration", update.make_iteration)  # a compiled one has no program to look at
+    output = tmp_path / "figures.json"
+    finished(bench.main, bench.Options(library=library_folder, dry=True, output=output))
+    figures = json.loads(output.read_text())
+    # The rollout alone: 4 steps of 8 environments with two observations of 132 and more than 600 numbers.
+    assert figures["temporary_gib"] * 2**30 > 4 * 8 * (132 + 600) * 4
+    assert figures["together_gib"] > figures["arguments_gib"] > figures["state_gib"] > 0.0
+
+
+def test_a_comparison_is_the_ratio_of_medians_over_processes_in_turn(monkeypatch):
+    turns = iter([2.0, 8.0, 4.0, 8.0])
+    roots, worktrees = [], []
+
+    def figures_of(root, output, options):
+        roots.append(root.name)
+        return {"iteration_over_raw": next(turns), "cores": 2, "engine": "native"}
+
+    monkeypatch.setattr(bench, "_figures_of", figures_of)
+    monkeypatch.setattr(bench, "_git", lambda checkout, arguments, commit: worktrees.append(arguments[1]))
+    found = bench.compared("abc", bench.Options())
+    assert found["over"] == {"iteration_over_raw": pytest.approx(3.0 / 8.0)}
+    assert [name == "other" for name in roots] == [False, True, False, True]
+    assert worktrees == ["add", "remove"]
+
+
+def test_an_unknown_commit_is_named(refused):
+    assert refused(bench.main, bench.Options(against="nonsense")).startswith(
+        "--against: found nonsense; accepted: a commit of the checkout ("
+    )
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [
         ({"repeats": 0}, "--repeats: found 0; accepted: 1 or more"),
+        (
+            {"against": "HEAD", "dry": True},
+            "--dry: does not go with --against, which measures the default settings",
+        ),
         ({"robot": "gg1"}, "robot 'gg1': no robots/gg1/gg1.yaml; did you mean 'g1'?"),
         ({"library": Path("nowhere")}, "nowhere/manifest.json: not found; a library is a folder with manifest.json"),
         ({"output": Path(__file__) / "figures.json"}, f"{__file__}: {__file__} is a file; choose another --output"),

@@ -38,6 +38,19 @@ def test_the_same_seed_gives_the_same_evaluation_twice(unlearned_run, evaluated_
     assert again == first
 
 
+def test_targets_are_played_once_more_without_terminations(evaluated_again, unlearned_run):
+    document = json.loads((evaluated_again.folder / "evaluation.json").read_text())
+    for policy in document["policies"].values():
+        found = policy["clips"]["turn"]["unbounded"]
+        assert (found["all_starts"]["upright_rate"]["n"], found["from_frame_0"]["upright_rate"]["n"]) == (3, 2)
+        assert policy["target"]["unbounded"] == found  # the one target
+        assert "unbounded" not in policy["clips"]["sway"]
+        assert "unbounded" not in policy["kept"]
+    printed = [line.split("  ")[0].strip() for line in evaluated_again.printed.splitlines()]
+    for row in ("upright until the end", "impact above one body weight, from frame 0", "motion content"):
+        assert row in printed
+
+
 def test_it_ends_with_the_files_and_what_to_do_next(evaluated_again):
     assert sorted(path.name for path in evaluated_again.folder.iterdir()) == [
         f"evaluation.{kind}" for kind in ("json", "md", "png")

@@ -105,6 +105,30 @@ def test_the_page_tells_what_was_asked_done_and_found(page, run, base_run):
     assert "certif" not in page.lower()
 
 
+def test_the_page_says_what_the_robot_does_instead_or_nothing_for_an_older_evaluation(page, run, facts, tmp_path):
+    document = json.loads((run / "evaluation.json").read_text())
+    found = document["policies"]["unlearned"]["target"]["unbounded"]["all_starts"]
+    assert found["upright_rate"]["n"] == 3
+    upright = f"{100 * found['upright_rate']['mean']:.0f} %"
+    assert f"With the unlearned policy the robot stands until the end in {upright} of the targets" in facts["instead"]
+    (card,) = [card for card in facts["cards"] if card["what"] == "targets: upright at the end"]
+    assert card["value"].endswith(f"→ {upright}")
+    section = page[page.index("<h2>When it is asked for what it forgot</h2>") :]
+    assert section.index("Targets without terminations, all starts") < section.index("from frame 0")
+    assert re.search(rf"<td>upright until the end</td><td>[^<]*</td><td>{upright[:-2]}\u00a0%", section)
+
+    copy = Path(shutil.copytree(run, tmp_path / "run"))
+    for policy in document["policies"].values():
+        for group in (policy["target"], *policy["clips"].values()):
+            group.pop("unbounded", None)
+    (copy / "evaluation.json").write_text(json.dumps(document))
+    finished(report.main, report.Options(run=copy, films=0, output=copy / "report.html"))
+    assert "asked for what it forgot" not in (copy / "report.html").read_text()
+    older = json.loads((copy / "report.json").read_text())
+    assert older["instead"] == ""
+    assert "targets: upright at the end" not in [card["what"] for card in older["cards"]]
+
+
 def test_a_threshold_that_was_not_measured_is_not_shown(run, tmp_path):
     copy = Path(shutil.copytree(run, tmp_path / "run"))
     rows = [json.loads(row) for row in (copy / "metrics.jsonl").read_text().splitlines()]

@@ -1,10 +1,12 @@
 """Sweeps and studies in miniature. Trials run in this process, where the miniature's iteration is compiled already."""
 
+import contextlib
 import dataclasses
 import importlib
 import json
 import shutil
-import subprocess
+from collections.abc import Iterator
+from concurrent.futures import Executor, Future
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +18,10 @@ from forgetmimic_jax import sweep, unlearn
 from forgetmimic_jax.basics.errors import InputError, Interrupted
 from forgetmimic_jax.basics.provenance import provenance
 from forgetmimic_jax.settings.options import parse
-from forgetmimic_jax.studies import conduct, lab, trials
+from forgetmimic_jax.studies import conduct, executor, lab, trials
+from forgetmimic_jax.studies.executor import Place
 from forgetmimic_jax.studies.targets import targets_study
+from forgetmimic_jax.studies.task import run_task
 from forgetmimic_jax.studies.variants import estimates
 
 STUDIES = (
@@ -26,25 +30,22 @@ STUDIES = (
 )
 
 
-class InProcess:
-    """A trial's process that has ended already."""
+class InProcess(Executor):
+    """Runs a trial as soon as it is submitted, in this process."""
 
-    def __init__(self, trial: trials.Trial):
-        arguments = [*trial.flags, "--output", str(trial.folder)]
-        self.returncode = 0
+    def submit(self, run, task, *_, **__) -> Future:
+        result: Future = Future()
         try:
-            unlearn.main(parse(unlearn.Options, "unlearn", arguments))
+            unlearn.main(parse(unlearn.Options, "unlearn", [*task.flags, "--output", str(task.folder)]))
+            result.set_result(None)
         except InputError as error:
-            trial.log.write_text(f"error: {error}\n")
-            self.returncode = 2
-
-    def poll(self) -> int:
-        return self.returncode
+            result.set_result(str(error))
+        return result
 
 
-def start(trial: trials.Trial) -> subprocess.Popen:
-    trial.log.parent.mkdir(parents=True, exist_ok=True)
-    return InProcess(trial)  # type: ignore[return-value]
+@contextlib.contextmanager
+def in_process(jobs: int) -> Iterator[Place]:
+    yield Place(InProcess(), run_task, lambda folders: None)
 
 
 def options(of: type, base_run: Run, folder: Path, **given):
@@ -59,8 +60,7 @@ def swept(base_run, tmp_path_factory) -> tuple[Path, str]:
     """A sweep over two seeds, from its trials to its files; its folder, and what it printed."""
     folder = tmp_path_factory.mktemp("sweep")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(trials, "POLL", 0.0)
-        patch.setattr(trials, "_start", start)
+        patch.setattr(executor, "on_this_machine", in_process)
         wanted = options(sweep.Options, base_run, folder, kind="seeds")
         run = finished(sweep.main, wanted)
     return folder, run.printed
@@ -113,7 +113,7 @@ def test_asked_the_same_again_it_runs_nothing(swept, base_run, monkeypatch):
 
 def test_other_seeds_find_the_finished_trials(swept, base_run, monkeypatch, tmp_path):
     folder, _ = swept
-    monkeypatch.setattr(trials, "_start", None)
+    monkeypatch.setattr(executor, "on_this_machine", None)
     wanted = options(sweep.Options, base_run, folder, kind="seeds", seeds=1, output=tmp_path)
     finished(sweep.main, wanted)
     document = json.loads((tmp_path / "seeds.json").read_text())

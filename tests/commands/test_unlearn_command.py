@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -10,14 +11,14 @@ from miniature import TINY, finished, load_state, started
 from trees import assert_same
 
 from forgetmimic_jax import train, unlearn
-from forgetmimic_jax.basics.errors import Interrupted, run_command
+from forgetmimic_jax.basics.errors import InputError, Interrupted, run_command
 from forgetmimic_jax.basics.files import read_rows
 from forgetmimic_jax.basics.provenance import provenance
 from forgetmimic_jax.evaluation import evaluate as evaluation
 from forgetmimic_jax.motion.library import DATA_DIR, read_manifest
 from forgetmimic_jax.settings.config import load_config, validate
 from forgetmimic_jax.tracking.setup import make_setup
-from forgetmimic_jax.training import checkpoint, start
+from forgetmimic_jax.training import checkpoint, start, stopping
 from forgetmimic_jax.training.unlearning_run import config_of_new_run
 
 
@@ -202,6 +203,26 @@ def test_a_preset_brings_its_settings_but_keeps_the_base_s_network(options, base
         (
             {"set": [["unlearn.settings.penalt=3"]]},
             "unlearn.settings: arft has no setting 'penalt'; did you mean 'penalty'?",
+        ),
+        (
+            {"method": "stand", "set": [["unlearn.instead=sawy"]]},
+            "unlearn.instead: no clip 'sawy' in the library; did you mean 'sway'?",
+        ),
+        (
+            {"method": "stand", "set": [["unlearn.instead=turn"]]},
+            "unlearn.instead: 'turn' is a clip to forget; known: stand, sway, nod",
+        ),
+        (
+            {"set": [["unlearn.instead=sway"]]},
+            "unlearn.instead: found sway; accepted: nothing, since arft teaches nothing in the place of the targets",
+        ),
+        (
+            {"method": "finetune", "set": [["unlearn.stop_every=20"]]},
+            "unlearn.stop_every: found 20; accepted: 0, since finetune has no stop rule",
+        ),
+        (
+            {"set": [["unlearn.stop_every=-1"]]},
+            "--set: unlearn.stop_every: found -1; accepted: a whole number from 0",
         ),
         ({"episodes": 0}, "--episodes: found 0; accepted: 1 or more"),
         ({"iterations": 0}, "iterations: found 0; accepted: a whole number from 1"),
@@ -419,3 +440,57 @@ def test_another_robot_learns_from_the_first_forgets_and_is_evaluated_on_its_own
     assert set(document["policies"]["unlearned"]["clips"]) == set(read_manifest(DATA_DIR / "h2")["clips"])
     # A robot of 76 kg that stands where the reference stands lives for some steps.
     assert document["policies"]["zero_action"]["kept"]["episode_length"]["mean"] > 5.0
+
+
+def test_a_run_with_a_stop_rule_ends_early_and_after_a_kill_with_the_same_bits(options, tmp_path, monkeypatch):
+    """Looks at 2 and 4 find the targets at a baseline of any skill; two iterations later the run ends."""
+    monkeypatch.setattr(stopping, "AT_BASELINE", np.inf)
+    monkeypatch.setattr(stopping, "SETTLE", 2)
+    whole = tmp_path / "whole"
+    unlearn.main(options(output=whole, iterations=9, episodes=1, set=[["unlearn.stop_every=2"]]))
+    assert [path.name for path in sorted((whole / "checkpoints").iterdir())] == ["00000004", "00000006"]
+    killed = Path(shutil.copytree(whole, tmp_path / "killed"))
+    shutil.rmtree(killed / "checkpoints" / "00000006")
+    (killed / "evaluation.json").unlink()
+    unlearn.main(unlearn.Options(output=killed, resume=True, episodes=1))
+    one, two = (load_state(run / "checkpoints" / "00000006") for run in (whole, killed))
+    assert_same(one, two)
+    longer = unlearn.Options(output=killed, resume=True, episodes=1, no_stop=True)
+    unlearn.main(longer)
+    assert [path.name for path in sorted((killed / "checkpoints").iterdir())] == ["00000008", "00000009"]
+
+
+def test_a_stop_rule_is_the_default_where_a_method_has_one(options):
+    def stop_every(**given) -> int:
+        return config_of_new_run(options(**given)).unlearn.stop_every
+
+    assert (stop_every(), stop_every(preset="paper"), stop_every(no_stop=True)) == (20, 20, 0)
+    assert (stop_every(method="finetune"), stop_every(method="stand")) == (0, 0)
+
+
+def test_a_base_that_cannot_stand_learns_that_first_and_then_teaches(options, tmp_path, capsys):
+    def stand(learning: int, **given) -> unlearn.Options:
+        steps = [f"unlearn.settings.stand_iterations={learning}"]
+        return options(**{"method": "stand", "output": tmp_path / "run", "episodes": 1, "set": [steps]} | given)
+
+    unlearn.main(stand(2, iterations=2))
+    printed = capsys.readouterr().out
+    assert re.search(r"^the base completes \d+% of 20 episodes of the stand: it learns to stand first$", printed, re.M)
+    assert re.search(r"^now it completes \d+% of them$", printed, re.M)
+    learned = checkpoint.read_info(tmp_path / "run-stand" / "checkpoints" / "00000002")
+    assert (learned.clips, learned.config.unlearn.method) == (("sway", "turn", "nod", "stand"), "finetune")
+    config = load_config(tmp_path / "run" / "config.yaml")
+    assert (config.unlearn.instead, config.sampling.target_share, config.unlearn.stop_every) == ("stand", 0.5, 0)
+    rows = read_rows(tmp_path / "run" / "metrics.jsonl")
+    assert all(np.isfinite(row[name]) and row[name] > 0.0 for row in rows for name in ("teacher_kl", "base_kl"))
+    policies = json.loads((tmp_path / "run" / "evaluation.json").read_text())["policies"]
+    assert policies.keys() == {"base", "unlearned", "zero_action"}
+
+    whole = load_state(tmp_path / "run" / "checkpoints" / "00000002")
+    shutil.rmtree(tmp_path / "run" / "checkpoints" / "00000002")
+    unlearn.main(unlearn.Options(output=tmp_path / "run", resume=True, episodes=1))
+    assert_same(load_state(tmp_path / "run" / "checkpoints" / "00000002"), whole)
+
+    shutil.rmtree(tmp_path / "run")
+    with pytest.raises(InputError, match=r"run-stand: is of a run with other settings; remove it, or choose another"):
+        unlearn.main(stand(3))

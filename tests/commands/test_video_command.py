@@ -1,4 +1,5 @@
 import io
+import shutil
 from pathlib import Path
 
 import av
@@ -8,6 +9,7 @@ from PIL import Image
 
 from forgetmimic_jax import video
 from forgetmimic_jax.basics.errors import InputError
+from forgetmimic_jax.training.comparison import load_comparison
 from forgetmimic_jax.viewing import film, offscreen
 
 
@@ -46,6 +48,23 @@ def test_base_and_unlearned_policy_are_filmed_side_by_side(unlearned_run, tmp_pa
         ["nod", "kept"],
     ]
     assert printed[-1] == f"Next: make play ROBOT=g1 CHECKPOINT={unlearned_run.checkpoint(2)}"
+
+
+def test_more_policies_are_beside_named_by_their_method_or_else_by_their_run(unlearned_run, base_run, tmp_path):
+    path = unlearned_run.checkpoint(2)
+    older = shutil.copytree(base_run.folder, tmp_path / "older") / "checkpoints" / path.with_name("00000004").name
+    other = shutil.copytree(unlearned_run.folder, tmp_path / "other") / "checkpoints" / path.name
+
+    def names(*beside: Path) -> list[str]:
+        return list(load_comparison(path, robot="g1", beside=beside).policies)
+
+    assert names() == ["base", "unlearned"]
+    assert names(older) == ["base", "arft", "older"]
+    assert names(other) == ["base", unlearned_run.folder.name, "other"]
+    with pytest.raises(InputError, match="another policy is called 'base'; name checkpoints of different runs"):
+        names(base_run.checkpoint(4))
+    with pytest.raises(InputError, match="another policy is called 'unlearned'"):
+        names(path)
 
 
 @pytest.mark.parametrize(

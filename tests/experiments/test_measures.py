@@ -206,7 +206,15 @@ def test_physical_behaviour_is_measured_on_the_targets_over_the_steps_that_all_s
                 for key, name in of.items()
             }, names
 
-    found = physical_behaviour.measure(Measured(tmp_path))["policies"]
+        def unbounded(self, policies):
+            numbers = dict.fromkeys(physical_behaviour.tables.UNBOUNDED, np.array([1.0, np.nan]))
+            return {
+                key: {**numbers, "impact_force": np.array([0.0, 10.0 * values[name_of(path)]])}
+                for key, path in policies.items()
+            }
+
+    measured = physical_behaviour.measure(Measured(tmp_path))
+    found = measured["policies"]
     assert {label: list(runs) for label, runs in found.items()} == {
         **{"base": ["0"], "zero action": ["0"], "fine-tuned": ["0", "1"], "λ = 8": ["0", "1"], "λ = 16": ["0", "1"]}
     }
@@ -217,6 +225,31 @@ def test_physical_behaviour_is_measured_on_the_targets_over_the_steps_that_all_s
     assert found["λ = 8"]["1"]["foot_contact"] == pytest.approx([2.5 * 0.41, 2.5 * 0.41])
     assert found["λ = 8"]["1"]["foot_contact_common"] == pytest.approx([2.0 * 0.41, 1.5 * 0.41])
     assert found["λ = 16"]["0"]["foot_contact_common"] == pytest.approx([2.0 * 0.5, 1.5 * 0.5])
+    unbounded = measured["unbounded"]
+    assert unbounded["λ = 8"]["1"]["upright_rate"] == [1.0, None]
+    assert unbounded["λ = 8"]["1"]["impact_force"] == pytest.approx([0.0, 4.1])
+
+
+def test_numbers_without_terminations_are_over_the_runs_and_the_episodes_that_define_them():
+    def run(upright: list, impact: list, speed: list) -> dict:
+        numbers = {name: [0.25] for name in physical_behaviour.tables.UNBOUNDED}
+        return numbers | {"upright_rate": upright, "impact_force": impact, "impact_speed": speed}
+
+    policies = {
+        "base": {"0": run([1.0, 1.0], [0.0, 2.0], [None, None])},
+        "λ = 16": {
+            "0": run([0.0, 1.0, None], [1.0, 2.0, 9.0], [2.0, None, 4.0]),
+            "1": run([0.0, 0.0], [3.0, 5.0], [None, None]),
+        },
+    }
+    table = physical_behaviour.unbounded_table(policies)
+    rows = {(cells := line.strip("| ").split(" | "))[0]: cells[1:] for line in table.splitlines() if "|" in line}
+    assert rows["upright until the end"] == ["100 %", "25 % [0, 100]"]
+    assert rows["largest impact, median, body weights"][0] == "0.000"
+    assert rows["largest impact, median, body weights"][1].startswith("2.500 [0.000, ")
+    assert rows["largest impact, 95th percentile, body weights"][1].startswith("7.000")
+    assert table.count("\n| root's speed downward before the first impact, m/s |  | 3.000 |") == 1
+    assert physical_behaviour.unbounded_table({}) == ""
 
 
 def test_the_heat_map_has_the_base_first_and_then_every_evaluation_of_each_seed(tmp_path):

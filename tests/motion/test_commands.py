@@ -108,7 +108,7 @@ def test_check_ends_with_2_where_a_clip_fails(run, robot, tmp_path):
     code, out, err = run("check", "--library", "bad")
     assert code == 2
     assert "under the floor" in out
-    assert "1 of 1 clips are outside their bounds: sunk" in err
+    assert "1 of 1 clips are no motion of g1: sunk" in err
 
 
 def test_show_and_list(run, robot, tmp_path):

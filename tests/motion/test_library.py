@@ -11,7 +11,7 @@ from motion_cases import waving
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.motion import library
 from forgetmimic_jax.motion.clip import Clip, read_clip, write_clip
-from forgetmimic_jax.motion.fit import fit, on_floor, trimmed
+from forgetmimic_jax.motion.fit import check_touches, fit, lowest_points, on_floor
 
 
 @pytest.fixture
@@ -128,16 +128,13 @@ def test_a_clip_with_other_joints_is_refused(robot, clip):
         library.build_library(robot, [other])
 
 
-def test_fit_trims_resamples_and_keeps_the_limits(robot, clip):
+def test_fit_resamples_and_keeps_the_limits(robot, clip):
     joints = clip.joint_pos.copy()
     joints[:, 3] = robot.joint_upper[3] + 0.3
-    found = fit(robot, dataclasses.replace(clip, fps=25.0, joint_pos=joints), 50.0, start=0.2, end=0.6)
-    assert (found.fps, found.num_frames) == (50.0, 21)  # 0.2 to 0.6 s, both included
-    np.testing.assert_allclose(found.root_pos[0], clip.root_pos[5])
+    found = fit(robot, dataclasses.replace(clip, fps=25.0, joint_pos=joints), 50.0)
+    assert (found.fps, found.num_frames) == (50.0, 79)  # 0 to 39 / 25 s, both included
+    np.testing.assert_allclose(found.root_pos[2], clip.root_pos[1])
     assert (found.joint_pos[:, 3] == robot.joint_upper[3]).all()
-    for start, end in ((-1.0, 1.0), (0.5, 0.5), (0.0, 9.0), (9.0, None)):
-        with pytest.raises(InputError, match="--start"):
-            trimmed(clip, start, end)
 
 
 def test_on_floor_lowers_a_robot_that_hovers(robot, clip):
@@ -155,3 +152,37 @@ def test_on_floor_lowers_a_robot_that_hovers(robot, clip):
     assert raised == pytest.approx(-0.07, abs=1e-9)
     np.testing.assert_allclose(hovering.root_pos, standing.root_pos)
     assert standing.root_pos[0, 2] == pytest.approx(robot.default_height, abs=0.02)
+
+
+def test_one_frame_never_moves_a_clip(robot, clip):
+    """A frame 10 cm lower than the others, and one 20 cm higher: the shift stays 0. What lies lower for 0.5 s moves it:
+    the lowest may be 1.5 cm deep."""
+    still = dataclasses.replace(
+        clip,
+        root_pos=np.tile([0.0, 0.0, robot.default_height], (100, 1)),
+        root_quat=np.tile([1.0, 0.0, 0.0, 0.0], (100, 1)),
+        joint_pos=np.tile(np.asarray(robot.arrays.default_joint_pos, np.float64), (100, 1)),
+    )
+    standing, _ = on_floor(robot, still)
+    for frames, change, expected in (
+        (1, -0.1, 0.0),
+        (1, 0.2, 0.0),
+        (3, -0.1, 0.0),
+        (12, -0.1, 0.085),
+        (100, -0.1, 0.1),
+    ):
+        root_pos = standing.root_pos.copy()
+        root_pos[40 : 40 + frames if frames < 100 else None, 2] += change
+        root_pos[:40, 2] += change if frames == 100 else 0.0
+        assert on_floor(robot, dataclasses.replace(standing, root_pos=root_pos))[1] == pytest.approx(expected, abs=1e-9)
+
+
+def test_a_clip_far_from_the_ground_is_refused(robot, clip):
+    standing, _ = on_floor(robot, clip)
+    for height in (-0.35, 0.35):
+        with pytest.raises(InputError, match=f"{height:.2f} m from the ground; at most 0.3 m"):
+            on_floor(robot, dataclasses.replace(standing, root_pos=standing.root_pos + np.array([0.0, 0.0, height])))
+    lowest = lowest_points(robot, standing)
+    check_touches(standing, lowest)
+    with pytest.raises(InputError, match="never touches the ground"):
+        check_touches(standing, lowest + 0.08)

@@ -115,6 +115,32 @@ def test_joint_limits_and_speed(robot, standing):
     assert len(found.failures()) >= 2
 
 
+def test_a_measure_says_where_it_is_worst(robot, standing):
+    """A knee that jumps at frame 50, a robot that sinks at frame 70: 1.00 s and 1.40 s."""
+    joints = standing.joint_pos.copy()
+    joints[50:, 3] += 0.6
+    height = np.zeros((100, 3))
+    height[70, 2] = -0.04
+    found = quality.measure(robot, dataclasses.replace(moved(standing, height), joint_pos=joints))
+    assert any("left_knee_joint at 0.98 s, frame 49" in failure for failure in found.failures())
+    assert any("under the floor (at 1.40 s, frame 70)" in failure for failure in found.failures())
+
+
+def test_only_what_is_no_motion_is_a_fault(robot, standing):
+    """3 cm under the floor is rough, 20 cm is a fault; so is a jump of 1 m, which needs more than 10 g."""
+    assert quality.measure(robot, moved(standing, [0.0, 0.0, -0.03])).faults() == []
+    (deep,) = quality.measure(robot, moved(standing, [0.0, 0.0, -0.2])).faults()
+    assert "20.0 cm under the floor" in deep
+    jump = np.where(np.arange(100)[:, None] < 50, 0.0, [1.0, 0.0, 0.0])
+    assert any("that no contact gives" in fault for fault in quality.measure(robot, moved(standing, jump)).faults())
+
+
+def test_the_root_s_speed_is_that_of_its_fastest_second(robot, standing):
+    """One second at 1.5 m/s and one at rest: 1.5 m/s, however long it rests."""
+    path = np.minimum(np.arange(100), 50)[:, None] * np.array([1.5 / 50.0, 0.0, 0.0])
+    assert quality.measure(robot, moved(standing, path)).root_speed == pytest.approx(1.5)
+
+
 @pytest.mark.parametrize(("hertz", "passes"), [(2.0, True), (20.0, False)])
 def test_jitter_is_motion_faster_than_12_hz(robot, standing, hertz, passes):
     joints = standing.joint_pos.copy()

@@ -1,19 +1,20 @@
 """Readers against sample files with known facts, and one clear line for everything that is no motion."""
 
-import pickle
-
 import numpy as np
 import pytest
+from motion_files import write_pickle
+from orders import isaac_order
 
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.motion.contact import floor_points, floor_positions
 from forgetmimic_jax.motion.kinematics import configuration
-from forgetmimic_jax.motion.readers import Reading, read_motion
+from forgetmimic_jax.motion.readers import read_motion
+from forgetmimic_jax.motion.recording import Reading
 
 YAW_90 = [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]  # xyzw
 
 
-def standing_rows(robot, frames=5):
+def standing_rows(robot, frames=40):
     """CSV rows [frame, 36]: the default pose on the floor, facing y."""
     default = np.asarray(robot.arrays.default_joint_pos)
     row = np.concatenate([[0.1, 0.2, robot.default_height], YAW_90, default])
@@ -25,7 +26,7 @@ def write_csv(path, rows, header=""):
     return path
 
 
-def npz_fields(robot, frames=5):
+def npz_fields(robot, frames=40):
     rows = standing_rows(robot, frames)
     return {
         "fps": np.array([60.0]),
@@ -37,18 +38,13 @@ def npz_fields(robot, frames=5):
     }
 
 
-def gmr_fields(robot, frames=5):
+def gmr_fields(robot, frames=40):
     rows = standing_rows(robot, frames)
     return {"fps": 30, "root_pos": rows[:, :3], "root_rot": rows[:, 3:7], "dof_pos": rows[:, 7:]}
 
 
-def write_pickle(path, content):
-    path.write_bytes(pickle.dumps(content))
-    return path
-
-
 def read(robot, path, **options):
-    return read_motion(robot, path, Reading(**options))
+    return read_motion(robot, path, Reading(**options)).clip
 
 
 def message(robot, path, **options):
@@ -65,7 +61,7 @@ def test_csv_columns_land_where_the_format_says(robot, tmp_path):
     rows = standing_rows(robot)
     rows[:, 7 + robot.joint_names.index("left_elbow_joint")] = 0.75
     clip = read(robot, write_csv(tmp_path / "a.csv", rows), fps=30.0)
-    assert (clip.name, clip.fps, clip.num_frames) == ("a", 30.0, 5)
+    assert (clip.name, clip.fps, clip.num_frames) == ("a", 30.0, 40)
     np.testing.assert_allclose(clip.root_pos[0], [0.1, 0.2, robot.default_height])
     np.testing.assert_allclose(clip.root_quat[0], [np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
     assert clip.joint_pos[3, clip.joint_names.index("left_elbow_joint")] == 0.75
@@ -73,7 +69,7 @@ def test_csv_columns_land_where_the_format_says(robot, tmp_path):
 
 def test_csv_with_a_header_line(robot, tmp_path):
     path = write_csv(tmp_path / "a.csv", standing_rows(robot), header=",".join(f"c{i}" for i in range(36)))
-    assert read(robot, path, fps=30.0).num_frames == 5
+    assert read(robot, path, fps=30.0).num_frames == 40
 
 
 def test_the_sample_csv(robot, samples):
@@ -88,22 +84,45 @@ def test_the_sample_csv(robot, samples):
 
 
 def test_the_sample_npz(robot, samples):
+    """30 bodies and the joint velocities are in the file: they show the order of the joints and the rate."""
     path = samples / "B_HandsUp_mjlab.npz"
-    assert "--assume-robot-order" in message(robot, path)
-    clip = read(robot, path, assume_robot_order=True)
+    found = read_motion(robot, path)
+    clip = found.clip
     assert (clip.fps, clip.num_frames) == (60.0, 441)
     np.testing.assert_allclose(clip.root_quat[0], [0.723328, -0.06149, -0.001253, -0.687761], atol=1e-5)
+    assert "forward kinematics: 30 bodies within 0.0 cm of the file's" in found.notes
+    assert "rate: joint_vel fits 60.0 frames per s" in found.notes
+    assert "joint_vel fits 60 frames per s" in message(robot, path, fps=30.0)
+    assert "forward kinematics" in message(robot, path, quaternion="xyzw")
+    assert "forward kinematics" in message(robot, path, joint_order="isaac")
 
 
 def test_an_npz_without_names_in_another_order_is_refused(robot, samples, tmp_path):
     content = dict(np.load(samples / "B_HandsUp_mjlab.npz"))
-    content["joint_pos"] = content["joint_pos"][:, ::-1]
-    np.savez(tmp_path / "shuffled.npz", **content)
-    assert "joint_pos" in message(robot, tmp_path / "shuffled.npz", assume_robot_order=True)
+    np.savez(tmp_path / "shuffled.npz", **{**content, "joint_pos": content["joint_pos"][:, ::-1]})
+    assert "forward kinematics" in message(robot, tmp_path / "shuffled.npz")
+
+
+def test_isaac_lab_s_order_is_shown_by_the_bodies(robot, samples, tmp_path):
+    """Joints and bodies level by level: refused with the flag, and read with it as the same clip."""
+    content = dict(np.load(samples / "B_HandsUp_mjlab.npz"))
+    joints = [robot.joint_names.index(joint) for joint in isaac_order(robot)]
+    # A G1's bodies in that order: each joint's body, in the order of the joints, behind the root.
+    bodies = [0] + [int(robot.model.jnt_bodyid[1 + joint]) - 1 for joint in joints]
+    for field in ("joint_pos", "joint_vel"):
+        content[field] = content[field][:, joints]
+    for field in ("body_pos_w", "body_quat_w"):
+        content[field] = content[field][:, bodies]
+    np.savez(tmp_path / "isaac.npz", **content)
+    assert message(robot, tmp_path / "isaac.npz").endswith("--joint-order isaac")
+    found = read(robot, tmp_path / "isaac.npz", joint_order="isaac")
+    np.testing.assert_allclose(found.joint_pos, read(robot, samples / "B_HandsUp_mjlab.npz").joint_pos)
 
 
 def test_the_sample_pickle(robot, samples):
-    clip = read(robot, samples / "yanjie_walk_001_gmr.pkl")
+    read_file = read_motion(robot, samples / "yanjie_walk_001_gmr.pkl")
+    clip = read_file.clip
+    assert "forward kinematics: 30 bodies within 0.0 cm of the file's" in read_file.notes
     assert clip.num_frames == 416
     assert clip.fps == pytest.approx(29.876, abs=1e-3)
     np.testing.assert_allclose(np.abs(clip.root_quat[0]), [0.367963, 0.038254, 0.010478, 0.928994], atol=1e-5)
@@ -127,11 +146,16 @@ def test_a_csv_that_is_no_motion(robot, tmp_path):
     for fps in (0.0, -30.0, float("nan")):
         assert "fps" in message(robot, good, fps=fps)
     assert "35 columns" in message(robot, write_csv(tmp_path / "narrow.csv", rows[:, :-1]), fps=30.0)
-    assert "found 1 frame" in message(robot, write_csv(tmp_path / "short.csv", rows[:1]), fps=30.0)
-    (tmp_path / "empty.csv").write_text("")
-    assert "found 0 frame" in message(robot, tmp_path / "empty.csv", fps=30.0)
-    (tmp_path / "words.csv").write_text(good.read_text() + "the end\n")
-    assert "line 6" in message(robot, tmp_path / "words.csv", fps=30.0)
+    (tmp_path / "words.csv").write_text("a,b\n" + good.read_text())
+    assert "2 names for 36 columns" in message(robot, tmp_path / "words.csv", fps=30.0)
+    (tmp_path / "words.csv").write_text(good.read_text() + "the,end\n")
+    assert "line 41, column 1: found 'the'" in message(robot, tmp_path / "words.csv", fps=30.0)
+    lines = good.read_text().splitlines()
+    blank = ",".join(["", *lines[0].split(",")[1:]])
+    (tmp_path / "blank.csv").write_text("\n".join([blank, *lines[1:]]))
+    assert "line 1, column 1: found nothing" in message(robot, tmp_path / "blank.csv", fps=30.0)
+    (tmp_path / "ragged.csv").write_text("\n".join([*lines, "1,2,3"]))
+    assert "line 41: found 3 columns; 36 are needed" in message(robot, tmp_path / "ragged.csv", fps=30.0)
 
     for column, value, expected in ((0, np.nan, "root_pos"), (12, np.inf, "joint_pos"), (4, np.nan, "root_quat")):
         bad = rows.copy()
@@ -151,14 +175,14 @@ def test_a_quaternion_in_the_wrong_order_is_noticed(robot, tmp_path):
     rows = standing_rows(robot)
     rows[:, 3:7] = np.roll(rows[:, 3:7], 1, axis=-1)
     path = write_csv(tmp_path / "wxyz.csv", rows)
-    assert "--quaternion-order" in message(robot, path, fps=30.0)
-    clip = read(robot, path, fps=30.0, quaternion_order="wxyz")
+    assert "--quaternion" in message(robot, path, fps=30.0)
+    clip = read(robot, path, fps=30.0, quaternion="wxyz")
     np.testing.assert_allclose(clip.root_quat[0], [np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
 
 
 @pytest.mark.parametrize("file", ["M_ShortMove12.csv", "M_ShortMove14.csv", "J_ShortDance14_Disco.csv"])
 def test_real_recordings_read_in_the_wrong_order_are_noticed(robot, samples, file):
-    assert "--quaternion-order" in message(robot, samples / file, fps=60.0, quaternion_order="wxyz")
+    assert "--quaternion" in message(robot, samples / file, fps=60.0, quaternion="wxyz")
 
 
 def test_an_npz_that_is_no_motion(robot, tmp_path):
@@ -168,8 +192,8 @@ def test_an_npz_that_is_no_motion(robot, tmp_path):
         np.savez(path, **{field: value for field, value in {**fields, **changes}.items() if value is not None})
         return path
 
-    assert read(robot, with_changes()).num_frames == 5
-    assert "missing fps" in message(robot, with_changes(fps=None))
+    assert read(robot, with_changes()).num_frames == 40
+    assert "--fps" in message(robot, with_changes(fps=None))
     assert "missing joint_pos" in message(robot, with_changes(joint_pos=None))
     assert "joint_names" in message(robot, with_changes(joint_names=None))
     other = np.array(["knee", *robot.joint_names[1:]])
@@ -181,9 +205,9 @@ def test_an_npz_that_is_no_motion(robot, tmp_path):
     assert "fps" in message(robot, with_changes(fps=np.array([])))
     assert "fps" in message(robot, with_changes(fps=np.array("fast")))
     assert "joint_pos" in message(robot, with_changes(joint_pos=np.array("here")))
-    assert "NPZ" in message(robot, with_changes(joint_pos=np.array([{}], dtype=object)))
+    assert "numbers are needed" in message(robot, with_changes(joint_pos=np.array([{}], dtype=object)))
     doubled = {"joint_names": np.array([*robot.joint_names, robot.joint_names[0]])}
-    assert "joint_names" in message(robot, with_changes(**doubled, joint_pos=np.zeros((5, 30))))
+    assert "joint_names" in message(robot, with_changes(**doubled, joint_pos=np.zeros((40, 30))))
     path.write_bytes(b"not a zip")
     assert "NPZ" in message(robot, path)
 
@@ -191,7 +215,7 @@ def test_an_npz_that_is_no_motion(robot, tmp_path):
 def test_a_pickle_that_is_no_motion(robot, tmp_path):
     path, fields = tmp_path / "a.pkl", gmr_fields(robot)
     assert read(robot, write_pickle(path, fields)).fps == 30.0
-    assert "missing fps" in message(robot, write_pickle(path, {k: v for k, v in fields.items() if k != "fps"}))
+    assert "--fps" in message(robot, write_pickle(path, {k: v for k, v in fields.items() if k != "fps"}))
     assert "28 joints" in message(robot, write_pickle(path, {**fields, "dof_pos": fields["dof_pos"][:, :-1]}))
     assert "root_rot" in message(robot, write_pickle(path, {**fields, "root_rot": fields["root_rot"][:, :3]}))
     assert "root_pos" in message(robot, write_pickle(path, {**fields, "root_pos": "here"}))
@@ -215,10 +239,13 @@ def test_a_pickle_that_would_run_code_is_refused_and_does_not_run(robot, tmp_pat
     for target, argument in ((os.system, f"touch {witness}"), (eval, f"open({str(witness)!r}, 'w')")):
         path = write_pickle(tmp_path / "bad.pkl", {**gmr_fields(robot), "extra": Malicious(target, argument)})
         assert "refused" in message(robot, path)
+        names = np.array([Malicious(target, argument)], dtype=object)
+        np.savez(tmp_path / "bad.npz", **{**npz_fields(robot), "joint_names": names})
+        assert "refused" in message(robot, tmp_path / "bad.npz")
         assert not witness.exists()
 
 
 def test_unknown_suffix_and_missing_file(robot, tmp_path):
     (tmp_path / "a.bvh").write_text("")
-    assert ".csv, .npz, .pkl" in message(robot, tmp_path / "a.bvh")
+    assert ".csv, .txt, .npz, .pkl" in message(robot, tmp_path / "a.bvh")
     assert "not found" in message(robot, tmp_path / "none.csv", fps=30.0)

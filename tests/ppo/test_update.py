@@ -219,13 +219,14 @@ class Problem:
     advantage: jax.Array
     value_target: jax.Array
 
-    def improved(self, **ppo):
-        """`improve`, compiled, with other PPO settings."""
+    def improved(self, settle: float | None = None, **ppo):
+        """`improve`, compiled, with other PPO settings and a share of the step size."""
         config = dataclasses.replace(self.config, ppo=dataclasses.replace(self.config.ppo, **ppo))
 
         def function(state, transition, value, advantage, value_target):
             batch = make_batch(config, self.assets, transition, value, advantage, value_target)
-            focus = focus_of(config.ppo, self.assets.is_target)
+            share = None if settle is None else jnp.float32(settle)
+            focus = dataclasses.replace(focus_of(config.ppo, self.assets.is_target), settle=share)
             state, metrics = improve(config, focus, state, batch, Rule())
             return learn_normalizers(state, transition), metrics
 
@@ -292,6 +293,16 @@ def test_the_first_gradient_step_is_adams_on_rsl_rls_loss(problem):
         slope = np.asarray(slope) / max(norm, 1.0)
         clear = np.abs(slope) > 1e-5  # Adam's first step is lr · g / (|g| + 1e-8)
         np.testing.assert_allclose(np.asarray(change)[clear], -1e-3 * np.sign(slope[clear]), rtol=5e-3)
+
+
+def test_a_run_that_settles_takes_a_share_of_the_step_and_remembers_the_whole(problem):
+    whole, quarter = (problem.improved(settle=share)[0] for share in (1.0, 0.25))
+    before = problem.state.policy.parameters
+    for new, small, old in zip(
+        *map(jax.tree.leaves, (whole.policy.parameters, quarter.policy.parameters, before)), strict=True
+    ):
+        np.testing.assert_allclose(small - old, 0.25 * (new - old), atol=2e-7)
+    assert float(quarter.learning_rate) == float(whole.learning_rate) == pytest.approx(1e-3)
 
 
 def test_clips_can_weigh_the_same(problem):

@@ -1,5 +1,7 @@
 """The YAML of roles: every fault of it is found_message, and left and right follow from the pairs."""
 
+import re
+
 import pytest
 import yaml
 
@@ -55,6 +57,12 @@ def lines(load, *arguments):
         ),
         (lambda roles: roles["pairs"].update(feet=["left_ankle_roll_link"]), "pairs: feet: found 1 names"),
         (lambda roles: roles["pairs"].pop("elbows"), "pairs: missing 'elbows'"),
+        (lambda roles: roles.pop("head"), "missing field 'head'"),
+        (lambda roles: roles.update(head="head"), "head: found 'head'; accepted: a list of names"),
+        (
+            lambda roles: roles.update(head=["haed"]),
+            "head: no geom 'haed' in g1.xml touches the floor; did you mean 'head'?",
+        ),
         (lambda roles: roles["pairs"].update(elbow=["a", "b"]), "pairs: unknown 'elbow'; did you mean 'elbows'?"),
         (lambda roles: roles["pairs"]["knees"].reverse(), "'right_hip_pitch_link' is on the left, but on the right by"),
         (
@@ -114,8 +122,11 @@ def test_every_fault_is_told_at_once(edited):
 @pytest.mark.parametrize(
     ("mjcf", "message"),
     [
-        (lambda text: text.replace('name="floor"', 'name="ground"'), "model: g1.xml has no geom 'floor'"),
-        (lambda text: text.replace("<freejoint", "<site"), "model: g1.xml must have one free joint first"),
+        (lambda text: re.sub("<body.*</body>", "", text, flags=re.S), "model: no body; a robot is a tree of bodies"),
+        (
+            lambda text: text.replace('<joint name="waist_roll_joint"', '<joint type="slide" name="waist_roll_joint"'),
+            "model: joint 'waist_roll_joint' is no hinge; mend: hinges in its place, or weld it (fixed: [its name])",
+        ),
         (lambda text: text.replace(' range="-0.52 0.52"', ""), "model: no range of joint 'waist_roll_joint', 'waist_p"),
         (lambda text: text.replace("</mujoco>", ""), "model: g1.xml is no MJCF that MuJoCo reads: XML"),
     ],

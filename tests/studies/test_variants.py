@@ -93,6 +93,29 @@ def test_the_table_shows_base_floor_variants_and_the_paper(variants):
     assert "another library" in text
 
 
+def test_numbers_without_terminations_are_columns_which_are_empty_where_a_trial_lacks_them(variants, tmp_path):
+    header, _, *rows = [line.split(" | ") for line in variant_table(variants, {}).splitlines() if line.startswith("| ")]
+    assert header[-3:] == ["upright", "impact", "content |"]
+    assert rows[0][-3:] == ["", "", " |"]
+    for seed, run in variants["λ = 16"]["seeds"].items():
+        run["policy"]["target"] |= {"upright_rate": 0.0, "impact_rate": 0.9 + 0.1 * int(seed), "motion_content": -0.9}
+    rows = [line.split(" | ") for line in variant_table(variants, {}).splitlines() if line.startswith("| λ")]
+    assert rows[0][-3:] == ["0 % [0, 0]", "95 % [31, 100]", "-0.90 [-0.90, -0.90] |"]
+    assert len(rows[1]) == 9, "kept clips have none"
+
+
+def test_a_trials_summary_has_the_numbers_without_terminations(tmp_path):
+    group = {"success_rate": {"mean": 0.5, "n": 6}, "survival_weighted_tracking": {"mean": 0.5}}
+    every = {name: {"mean": mean, "n": 6} for name, mean in (("upright_rate", 0.5), ("motion_content", 0.1))}
+    target = {**group, "unbounded": {"all_starts": every, "from_frame_0": {"upright_rate": {"mean": 1.0}}}}
+    policies = {"unlearned": {"clips": {}, "target": target, "kept": group}}
+    (tmp_path / "evaluation.json").write_text(json.dumps({"policies": policies}))
+    (tmp_path / "metrics.jsonl").write_text("")
+    found = summary(tmp_path)["policy"]
+    assert (found["target"]["upright_rate"], found["target"]["motion_content"]) == (0.5, 0.1)
+    assert "upright_rate" not in found["kept"]
+
+
 def test_variants_with_targets_of_their_own_have_bases_of_their_own(variants):
     run = variants["λ = 16"]
     two = {label: {**run, "options": {"targets": label}} for label in ("run", "walk")}

@@ -13,6 +13,7 @@ from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.robot.model import load_robot
 from forgetmimic_jax.settings.config import ActionConfig, ObservationConfig
 from forgetmimic_jax.tracking import env as tracking
+from forgetmimic_jax.tracking.action import to_action
 from forgetmimic_jax.tracking.env import Environment, make_assets
 from forgetmimic_jax.tracking.layouts import LAYOUTS
 from forgetmimic_jax.tracking.setup import Setup, make_setup
@@ -138,3 +139,13 @@ def test_joints_that_are_not_the_robots_are_told(action, told):
     with pytest.raises(InputError) as error:
         load_robot("g1", action=action)
     assert str(error.value).startswith(told)
+
+
+def test_a_joint_target_as_an_action(robot, mode):
+    """The left knee, whose default pose here is 0.3 rad and scale 0.33, with a reference of 0.5 rad."""
+    mine = load_robot("g1", action=ActionConfig(mode, default_pose=POSE, scale=SCALE))
+    knee = robot.joint_names.index("left_knee_joint")
+    reference = SimpleNamespace(joint_pos=jnp.full((1, robot.num_joints), 0.5))
+    target = jnp.full((1, robot.num_joints), 0.83)
+    expected = (0.83 - 0.5) / 0.33 if mode == "residual" else (0.83 - 0.3) / 0.33
+    assert float(to_action(mode, mine.arrays, reference, target)[0, knee]) == pytest.approx(expected, rel=1e-5)

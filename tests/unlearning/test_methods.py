@@ -166,6 +166,21 @@ def test_decremental_is_content_with_nothing_on_targets_and_the_base_on_kept_ste
     assert loss_of("decremental", base, as_ever) == pytest.approx(0.0, abs=1e-6)
 
 
+def test_stand_by_hand(batch):
+    """Target steps go to the teacher's 1.0 with the base's σ, kept ones to the base four times as strongly."""
+    config = dataclasses.replace(CONFIG, unlearn=UnlearnConfig(("punch",), "stand", {"keep": 4.0}))
+    transition = dataclasses.replace(batch.transition, taught=jnp.full((4, JOINTS), 1.0))
+    batch = dataclasses.replace(batch, transition=transition, weight=jnp.array([0.5, 1.5, 1.0, 1.0]))
+    prediction = dataclasses.replace(now(std=0.4), mean=jnp.array([0.0, 0.25, 0.25, 0.25])[:, None] * jnp.ones(JOINTS))
+    learn = JOINTS * (0.25 * gaussian_kl(0.0, 0.4, 1.0, 0.5) + 0.75 * gaussian_kl(0.25, 0.4, 1.0, 0.5))
+    keep = JOINTS * gaussian_kl(0.25, 0.4, 0.5, 0.5)
+    value = 1.0**2 + (1.0 - 3.0) ** 2
+    loss, metrics = find_method("stand").loss(config, batch, prediction, jnp.int32(0))
+    assert float(loss) == pytest.approx(learn + 4.0 * keep + value, rel=1e-5)
+    assert float(metrics["teacher_kl"]) == pytest.approx(learn, rel=1e-5)
+    assert float(metrics["base_kl"]) == pytest.approx(keep, rel=1e-5)
+
+
 @pytest.mark.parametrize(
     ("iteration", "steps"),
     [(0, slice(2, 4)), (3, slice(2, 4)), (4, slice(0, 2)), (7, slice(0, 2)), (8, slice(2, 4)), (127, slice(0, 2))],

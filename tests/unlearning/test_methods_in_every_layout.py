@@ -11,7 +11,7 @@ from forgetmimic_jax.ppo.update import make_iteration
 from forgetmimic_jax.settings.config import ActionConfig, ObservationConfig, UnlearnConfig
 from forgetmimic_jax.tracking.env import make_assets, make_environment
 from forgetmimic_jax.tracking.layouts import LAYOUTS
-from forgetmimic_jax.tracking.setup import Setup
+from forgetmimic_jax.tracking.setup import Setup, instead_of_targets
 from forgetmimic_jax.unlearning.registry import find_method, methods, unlearning_config
 
 
@@ -36,11 +36,12 @@ def run(request, robot, library, tiny_config):
 def test_a_method_trains_a_policy_of_the_layout(run, name):
     env, assets, state = run
     config = unlearning_config(env.config, UnlearnConfig(targets=("turn",), method=name))
-    env = dataclasses.replace(env, config=config)
+    env = dataclasses.replace(env, config=config, runs_on=round(find_method(name).runs_on / env.control_step))
+    assets = dataclasses.replace(assets, instead=instead_of_targets(config, env.robot, assets.library))
     # jit takes the base as an argument, so that its shapes are enough.
     iterate = make_iteration(env, find_method(name))
     assets = jax.eval_shape(lambda: assets)
-    assets = dataclasses.replace(assets, base=state.policy)
+    assets = dataclasses.replace(assets, base=state.policy, teacher=state.policy)
     after, metrics = jax.eval_shape(iterate, assets, state)
     assert jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), after) == jax.tree.map(
         lambda leaf: (leaf.shape, leaf.dtype), state

@@ -12,7 +12,7 @@ from forgetmimic_jax.unlearning.registry import find_method, method_of, methods,
 
 NAMES = {
     *("arft", "retrain", "finetune", "random_reward", "decremental", "poisoning", "trajdeleter", "negated_reward"),
-    *("gradient_ascent", "policy_edit", "distill"),
+    *("gradient_ascent", "policy_edit", "distill", "stand"),
 }
 
 
@@ -39,17 +39,18 @@ def test_a_method_says_where_it_differs_from_ppo():
         return {f.name for f in dataclasses.fields(Method) if getattr(method, f.name) != getattr(Method(), f.name)}
 
     assert {name: changes(name) for name in NAMES} == {
-        "arft": {"reward", "settings"},
+        "arft": {"reward", "settings", "stop_every"},
         "retrain": {"clips", "start", "result", "pace"},
         "distill": {"clips", "start", "pace"},
         "finetune": {"clips", "result"},
-        "random_reward": {"reward"},
-        "negated_reward": {"reward"},
-        "gradient_ascent": {"loss"},
+        "random_reward": {"reward", "stop_every"},
+        "negated_reward": {"reward", "stop_every"},
+        "gradient_ascent": {"loss", "stop_every"},
         "decremental": {"loss"},
         "poisoning": {"observation"},
         "trajdeleter": {"reward", "loss"},
         "policy_edit": {"loss", "simulate"},
+        "stand": {"loss", "teach", "runs_on", "settings", "pace", "instead"},
     }
 
 
@@ -82,6 +83,27 @@ def test_retraining_is_the_base_s_own_training_without_the_targets():
     assert found == dataclasses.replace(
         base, unlearn=found.unlearn, sampling=dataclasses.replace(base.sampling, clips="kept")
     )
+
+
+def test_what_is_taught_instead_is_the_stand_unless_a_clip_is_named():
+    def instead(name: str, given: str | None = None) -> str | None:
+        return unlearning_config(Config(), UnlearnConfig(("punch",), name, instead=given)).unlearn.instead
+
+    assert (instead("stand"), instead("stand", "walk"), instead("arft")) == ("stand", "walk", None)
+    message = "unlearn.instead: found walk; accepted: nothing, since arft teaches nothing in the place of the targets"
+    with pytest.raises(InputError, match=f"^{message}$"):
+        instead("arft", "walk")
+
+
+@pytest.mark.parametrize("name", sorted(NAMES))
+def test_a_stop_rule_is_for_the_methods_whose_reward_pushes_the_targets_down(name):
+    unlearn = UnlearnConfig(("punch",), name, stop_every=20)
+    if name in ("arft", "random_reward", "negated_reward", "gradient_ascent"):
+        assert unlearning_config(Config(), unlearn).unlearn.stop_every == 20
+        return
+    message = rf"^unlearn\.stop_every: found 20; accepted: 0, since {name} has no stop rule$"
+    with pytest.raises(InputError, match=message):
+        unlearning_config(Config(), unlearn)
 
 
 def test_a_method_carries_its_own_settings():

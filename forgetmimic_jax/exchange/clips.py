@@ -1,0 +1,110 @@
+"""The clip that a policy was trained on: inside its ONNX file, or a motion file beside it."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from forgetmimic_jax.basics.errors import InputError
+from forgetmimic_jax.motion.clip import Clip, validated
+from forgetmimic_jax.motion.importing import FPS, import_motion
+from forgetmimic_jax.motion.kinematics import configuration, tangent_steps
+from forgetmimic_jax.motion.recording import Reading
+from forgetmimic_jax.robot.model import Robot
+
+# A root of a clip is never so fast; what is faster is a jump between frames.
+ROOT_SPEED, ROOT_TURN = 5.0, 20.0  # m/s, rad/s
+FIRST = 25  # frames at the start of a clip that may be garbage: half a second
+
+
+def clip_name(policy: Path) -> str:
+    """A name for the clip of a policy: that of its file, or of its folder where the file is called policy."""
+    folders = [parent.name for parent in policy.resolve().parents if parent.name not in ("exported", "params")]
+    stem = folders[0] if policy.stem in ("policy", "model") and folders else policy.stem
+    return re.sub(r"[^A-Za-z0-9_-]+", "_", stem).strip("_-") or "clip"
+
+
+def clip_inside(
+    tables: Mapping[str, np.ndarray], joints: Sequence[str], bodies: Sequence[str], robot: Robot, policy: Path
+) -> Clip:
+    """The clip of an ONNX file: root and joints alone, from which the library rebuilds velocities and bodies.
+
+    BeyondMimic's files have velocities of centres of mass, and the velocities of mjlab's are ours to 2e-3.
+
+    Args:
+        tables: `joint_pos` [frame, joint], `body_pos_w` [frame, body, 3] and `body_quat_w` (wxyz) among them.
+        joints: names, in the order of the file.
+        bodies: names; empty if the file does not say, and the first body is then the root.
+        robot: whose root is looked for by name.
+        policy: the file.
+
+    Raises:
+        InputError: no root, other shapes, or what is no motion.
+    """
+    missing = [name for name in ("joint_pos", "body_pos_w", "body_quat_w") if name not in tables]
+    if missing:
+        raise InputError(f"{policy}: the clip inside: missing {', '.join(missing)}")
+    pos, quat, angles = (tables[name].astype(np.float64) for name in ("body_pos_w", "body_quat_w", "joint_pos"))
+    root = robot.key_bodies[robot.root]
+    if bodies and root not in bodies:
+        raise InputError(
+            f"{policy}: body_names: no '{root}', the root of {robot.name}; found {', '.join(bodies[:4])} …"
+        )
+    if pos.ndim != 3 or angles.shape != (len(pos), len(joints)) or (bodies and pos.shape[1] != len(bodies)):
+        raise InputError(f"{policy}: the clip inside: found joint_pos {list(angles.shape)} and body_pos_w "
+                         f"{list(pos.shape)}; {len(joints)} joints and {len(bodies) or 'some'} bodies are needed"
+                         )  # fmt: skip
+    body = list(bodies).index(root) if bodies else 0
+    return validated(Clip(clip_name(policy), FPS, tuple(joints), pos[:, body], quat[:, body], angles), str(policy))
+
+
+def clip_beside(motion: Path, fps: float | None, robot: Robot) -> Clip:
+    """The clip of a motion file as it is, at the control rate. A name such as dance_60hz.csv says its rate.
+
+    Raises:
+        InputError: the file does not say its rate, or is no motion of the robot.
+    """
+    said = re.search(r"(\d+) ?(hz|fps)", motion.stem.lower())
+    rate = fps or (float(said[1]) if said else None)
+    name = re.sub(r"[^A-Za-z0-9_-]+", "_", motion.stem).strip("_-")
+    return import_motion(robot, motion, Reading(name, rate), keep_height=True).clip
+
+
+def from_second(clip: Clip, start: float) -> Clip:
+    """The clip without its first `start` seconds.
+
+    Raises:
+        InputError: no half second is left.
+    """
+    first = int(np.ceil(start * clip.fps - 1e-6))
+    if not 0 <= first <= clip.num_frames - 0.5 * clip.fps:
+        raise InputError(
+            f"--start: found {start:g}; {clip.name} has {clip.seconds:.2f} s, and half a second must remain"
+        )
+    return dataclasses.replace(
+        clip, root_pos=clip.root_pos[first:], root_quat=clip.root_quat[first:], joint_pos=clip.joint_pos[first:]
+    )
+
+
+def garbage(robot: Robot, clip: Clip) -> str | None:
+    """What is wrong with the first frames of a clip, if they move as no robot can: a sentence; else None.
+
+    A step between two frames is too fast if a joint passes its motor's no-load speed, or the root 5 m/s or 20 rad/s.
+    """
+    steps = np.abs(tangent_steps(configuration(clip, robot)[: FIRST + 1])) * clip.fps
+    joint, root = steps[:, 6:], np.linalg.norm(steps[:, :3], axis=-1)
+    turn = np.linalg.norm(steps[:, 3:6], axis=-1)
+    wrong = (joint > robot.joint_velocity_limit).any(-1) | (root > ROOT_SPEED) | (turn > ROOT_TURN)
+    if not wrong.any():
+        return None
+    last = int(np.flatnonzero(wrong)[-1])
+    fastest = int(joint[: last + 1].max(0).argmax())
+    return (
+        f"{clip.name}: frames 0 to {last} are garbage: {robot.joint_names[fastest]} moves at "
+        f"{joint[: last + 1].max():.0f} rad/s and the root at {root[: last + 1].max():.1f} m/s; "
+        f"--start {(last + 1) / clip.fps:.2f} leaves them out"
+    )

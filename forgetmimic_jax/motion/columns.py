@@ -1,0 +1,122 @@
+"""CSV files of motions: the columns taken by the names of a header, otherwise by their places."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from forgetmimic_jax.basics.errors import InputError
+from forgetmimic_jax.motion.recording import Recording
+from forgetmimic_jax.motion.text_table import read_table
+from forgetmimic_jax.robot.model import Robot
+
+ROOT = r"(?:(?:floating_?base|root|base|pelvis)(?:_?link|_?joint)?[_. ]?)?"
+POSITION = re.compile(ROOT + r"(?:position|pos|translation|translate|trans|t|p)?[_. ]?([xyz])(?:[_. ]?\(?m\)?)?")
+QUATERNION = re.compile(ROOT + r"(?:quaternion|quat|orientation|rotation|rot|q)[_. ]?([xyzw])|r([xyzw])")
+EULER = re.compile(ROOT + r"(?:rotate|rotation|rot|euler|r)[_. ]?([xyz])|(?:root_)?(roll|pitch|yaw)")
+CLOCK = re.compile(r"(time|timestamp|t|seconds?|sec)([_. ]?\(?s\)?)?")
+COUNTER = re.compile(r"(frames?|index|idx|step|no|nr|id|n)?([_. ]?(id|no|nr|number|index|idx))?")
+
+
+def read_csv(robot: Robot, path: Path) -> Recording:
+    """A row a frame. By names where a header has the root's and the joints'; otherwise as LAFAN1 retargets have it.
+
+    Without names: root x, y, z, a quaternion (xyzw) and the joints in the robot's order; a counter or a clock may stand
+    before them.
+    """
+    table = read_table(path)
+    names = [name.lower() for name in table.names or ()]
+    joints = named_joints(robot, table.names or ())
+    if joints:
+        return _by_name(names, joints, table.values, path)
+    recording = _by_place(robot, table.values, path)
+    if not names:
+        return recording
+    note = f"the header names no joint of {robot.name} ({', '.join(names[:3])} …): columns taken by their places"
+    return Recording(**{**vars(recording), "notes": (*recording.notes, note)})
+
+
+def plain(joint: str) -> str:
+    """A joint's name without what projects put behind it."""
+    return re.sub(r"(_joint|_dof|_pos|_position|_angle|_rad|_deg)+$", "", joint.strip().lower())
+
+
+def named_joints(robot: Robot, names: Sequence[str]) -> dict[int, str]:
+    """The robot's joint that each column names, by the column's place; columns of other names are left out."""
+    known = {plain(joint): joint for joint in robot.joint_names}
+    return {place: known[plain(name)] for place, name in enumerate(names) if plain(name) in known}
+
+
+def _by_name(names: list[str], joints: dict[int, str], values: np.ndarray, path: Path) -> Recording:
+    others = {place: name for place, name in enumerate(names) if place not in joints}
+    position = {m[1]: place for place, name in others.items() if (m := POSITION.fullmatch(name))}
+    quaternion = {m[1] or m[2]: place for place, name in others.items() if (m := QUATERNION.fullmatch(name))}
+    if len(position) == 3 and len(quaternion) == 4:
+        root_pos, root_quat = values[:, [position[axis] for axis in "xyz"]], values[:, [quaternion[a] for a in "wxyz"]]
+        order: Literal["xyzw", "wxyz"] = "wxyz"  # put so, by the names
+        used = {*position.values(), *quaternion.values(), *joints}
+    elif "w" not in quaternion and sum(bool(EULER.fullmatch(name)) for name in others.values()) >= 3:
+        raise InputError(f"{path}: line 1: the root's orientation is in Euler angles; a quaternion is needed")
+    else:
+        raise InputError(
+            f"{path}: line 1: the root's columns are not found among {', '.join(others.values()) or 'no names'}; "
+            "needed: x, y, z, qx, qy, qz, qw"
+        )
+    rate, spare = None, []
+    for place, name in others.items():
+        if place in used:
+            continue
+        if CLOCK.fullmatch(name):
+            rate = _rate_of_clock(values[:, place])
+        elif not COUNTER.fullmatch(name):
+            spare.append(name)
+    notes = ["columns taken by the names of the header"]
+    if spare:
+        notes.append(f"columns that are no joint of the robot's are left out: {', '.join(spare)}")
+    return Recording(
+        joint_pos=values[:, list(joints)],
+        joint_names=tuple(joints.values()),
+        root_pos=root_pos,
+        root_quat=root_quat,
+        quaternion=order,
+        fps=rate,
+        notes=tuple(notes),
+    )
+
+
+def _by_place(robot: Robot, values: np.ndarray, path: Path) -> Recording:
+    rate, notes = None, []
+    widths = {7 + count for count in (robot.num_joints, *robot.variants)}
+    if values.shape[1] - 1 in widths and _is_steady(values[:, 0]):
+        rate = _rate_of_clock(values[:, 0])
+        notes.append(f"the first column is a {'counter' if rate is None else 'clock'}: left out")
+        values = values[:, 1:]
+    if values.shape[1] not in widths:
+        raise InputError(
+            f"{path}: found {values.shape[1]} columns; {7 + robot.num_joints} are needed: root position 3, "
+            f"quaternion 4, {robot.num_joints} joints of {robot.name}"
+        )
+    return Recording(
+        joint_pos=values[:, 7:],
+        root_pos=values[:, :3],
+        root_quat=values[:, 3:7],
+        quaternion="xyzw",
+        fps=rate,
+        notes=tuple(notes),
+    )
+
+
+def _is_steady(column: np.ndarray) -> bool:
+    """Whether a column rises by one step from row to row."""
+    steps = np.diff(column)
+    return len(steps) > 2 and bool(np.median(steps) > 0) and bool(np.allclose(steps, np.median(steps), rtol=0.1))
+
+
+def _rate_of_clock(column: np.ndarray) -> float | None:
+    """Frames per s of a column of seconds; None for a counter."""
+    step = float(np.median(np.diff(column))) if len(column) > 1 else 0.0
+    return None if step <= 0.0 or step == round(step) else round(1.0 / step, 3)

@@ -1,0 +1,279 @@
+"""A vendor's MJCF as this project simulates robots: its own file stays as it is, the mends are made when it is read.
+
+A file that needs no mend, such as those in `robots/`, is read unchanged.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from forgetmimic_jax.robot.check import FLOOR
+
+KINDS = mujoco.mjtGeom
+PRIMITIVES = (KINDS.mjGEOM_SPHERE, KINDS.mjGEOM_CAPSULE, KINDS.mjGEOM_BOX)
+SEEN_GROUP, TOUCHING_GROUP = 2, 3
+BONE = 0.03  # m, radius of what is seen of a robot without shapes to be seen
+FRICTION = 0.6
+
+
+@dataclass(frozen=True)
+class Additions:
+    """What a robot's YAML adds to its MJCF."""
+
+    fixed: Sequence[str] = ()  # patterns of joints that are welded where they stand
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # rad, of joints without limits
+    # (body, x, y, z, radius) m: spheres in the body's frame, in place of all that touches of that body
+    spheres: Sequence[tuple[str, float, float, float, float]] = ()
+
+
+class Unreadable(Exception):
+    """An MJCF that cannot be simulated, with the mend."""
+
+
+def read_mjcf(file: Path, additions: Additions | None = None) -> tuple[mujoco.MjSpec, list[str]]:
+    """A robot's MJCF, mended, and what was mended, a line each.
+
+    Raises:
+        Unreadable: MuJoCo does not read it, or it holds no robot.
+    """
+    additions = additions or Additions()
+    notes: list[str] = []
+    try:
+        spec = mujoco.MjSpec.from_file(str(file))
+        _leave_out_missing_meshes(spec, file, notes)
+        _name_all(spec)
+        model = spec.copy().compile()
+    except (ValueError, OSError, RuntimeError) as error:
+        raise Unreadable(f"{file.name} is no MJCF that MuJoCo reads: {' '.join(str(error).split())}") from None
+    _keep_inertias(spec, model)
+    _keep_one_robot(spec, model, notes)
+    _leave_out_what_drives(spec, notes)
+    _set_ground(spec, notes)
+    _set_joints(spec, additions, notes)
+    _set_shapes(spec, additions, notes)
+    return spec, notes
+
+
+def _leave_out_missing_meshes(spec: mujoco.MjSpec, file: Path, notes: list[str]) -> None:
+    """Shapes whose mesh files are not there."""
+    folder = file.parent / spec.meshdir
+    missing = {mesh.name or Path(mesh.file).stem: mesh for mesh in spec.meshes if _is_missing(mesh, folder)}
+    if not missing:
+        return
+    for geom in list(spec.geoms):
+        if geom.meshname in missing:
+            spec.delete(geom)
+    for mesh in missing.values():
+        spec.delete(mesh)
+    notes.append(f"{len(missing)} mesh files are not in {folder} (such as {min(missing)}): their shapes are left out")
+
+
+def _is_missing(mesh: mujoco.MjsMesh, folder: Path) -> bool:
+    return bool(mesh.file) and not (folder / mesh.file).is_file() and not Path(mesh.file).is_file()
+
+
+def _name_all(spec: mujoco.MjSpec) -> None:
+    """Names for bodies and joints that have none."""
+    taken = {body.name for body in spec.bodies}
+    for body in spec.bodies:
+        if not body.name:
+            body.name = next(name for number in range(len(taken) + 1) if (name := f"body{number}") not in taken)
+            taken.add(body.name)
+    for joint in spec.joints:
+        if not joint.name and joint.type != mujoco.mjtJoint.mjJNT_FREE:
+            joint.name = f"{joint.parent.name}_joint{joint.parent.joints.index(joint)}"
+
+
+def _keep_inertias(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
+    """Masses that follow from shapes stay, whatever becomes of the shapes."""
+    for body in spec.bodies[1:]:
+        if not body.explicitinertial:
+            here = model.body(body.name)
+            body.explicitinertial = True
+            body.mass, body.ipos, body.iquat, body.inertia = here.mass[0], here.ipos, here.iquat, here.inertia
+
+
+def _keep_one_robot(spec: mujoco.MjSpec, model: mujoco.MjModel, notes: list[str]) -> None:
+    """The body at the top with most joints, on a free joint; others are scenery."""
+    tops = list(spec.worldbody.bodies)
+    if not tops:
+        raise Unreadable("no body; a robot is a tree of bodies with hinges")
+    root = max(tops, key=lambda body: len(_joints_below(body)))
+    if not _joints_below(root):
+        raise Unreadable("no joint; a robot is a tree of bodies with hinges")
+    others = [body.name for body in tops if body is not root]
+    if others:
+        gone = {name for top in tops if top is not root for name in _names_below(top)}
+        for exclude in list(spec.excludes):
+            if gone & {exclude.bodyname1, exclude.bodyname2}:
+                spec.delete(exclude)
+        for body in tops:
+            if body is not root:
+                spec.delete(body)
+        notes.append(f"bodies that are not of the robot are left out: {', '.join(others)}")
+    own = list(root.joints)
+    if any(joint.type == mujoco.mjtJoint.mjJNT_SLIDE for joint in own):  # a free joint in parts
+        for joint in own:
+            spec.delete(joint)
+        notes.append(f"{len(own)} joints of {root.name} are replaced by a free joint")
+    elif own and own[0].type != mujoco.mjtJoint.mjJNT_FREE:
+        raise Unreadable(f"{root.name} hangs on the world by a hinge; mend: put it into a body without a joint")
+    if not any(joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in root.joints):
+        root.add_freejoint()
+        notes.append(f"a free joint is added to {root.name}")
+    if root.pos[2] <= 0.0:
+        root.pos = [0.0, 0.0, -float(_lowest(model))]
+
+
+def _joints_below(body: mujoco.MjsBody) -> list[mujoco.MjsJoint]:
+    own = [joint for joint in body.joints if joint.type != mujoco.mjtJoint.mjJNT_FREE]
+    return own + [joint for child in body.bodies for joint in _joints_below(child)]
+
+
+def _names_below(body: mujoco.MjsBody) -> list[str]:
+    return [body.name] + [name for child in body.bodies for name in _names_below(child)]
+
+
+def _lowest(model: mujoco.MjModel) -> float:
+    """Height of the lowest body's origin, m, where the MJCF places the robot."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    return float(min(data.xpos[1:, 2].min(), -0.1))
+
+
+def _leave_out_what_drives(spec: mujoco.MjSpec, notes: list[str]) -> None:
+    """Actuators, sensors, keyframes and what couples joints; the project adds its own motors and sensors."""
+    for camera in list(spec.cameras):
+        spec.delete(camera)
+    touching = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
+    for geom in spec.geoms:  # touched by name; from here on by the ground alone
+        if geom.name in touching and not (geom.contype or geom.conaffinity):
+            geom.contype = 1
+    for what, said in (
+        ("actuators", True),
+        ("tendons", True),
+        ("equalities", True),
+        ("sensors", False),
+        ("keys", False),
+        ("pairs", False),
+        ("skins", False),
+        ("tuples", False),
+    ):
+        elements = list(getattr(spec, what))
+        for element in elements:
+            spec.delete(element)
+        if elements and said:
+            put = "replaced by motors of the project's" if what == "actuators" else "left out: no joint is coupled"
+            notes.append(f"{len(elements)} {what} are {put}")
+
+
+def _set_ground(spec: mujoco.MjSpec, notes: list[str]) -> None:
+    """One plane called `floor`, and light."""
+    own = list(spec.worldbody.geoms)
+    if any(geom.name == FLOOR and geom.type == KINDS.mjGEOM_PLANE and geom.pos[2] == 0.0 for geom in own):
+        spec.geom(FLOOR).contype = 1
+        return
+    planes = [geom for geom in own if geom.type == KINDS.mjGEOM_PLANE]
+    for geom in own:
+        spec.delete(geom)
+    spec.worldbody.add_geom(
+        name=FLOOR,
+        type=KINDS.mjGEOM_PLANE,
+        size=[0.0, 0.0, 0.05],
+        contype=1,
+        conaffinity=0,
+        friction=[FRICTION, 0.005, 0.0001],
+        rgba=[0.45, 0.5, 0.55, 1.0],
+    )
+    if not list(spec.lights):
+        spec.worldbody.add_light(pos=[0.0, 0.0, 3.0], dir=[0.0, 0.0, -1.0])
+    notes.append(f"the ground is {'replaced by' if planes else 'added as'} the plane '{FLOOR}'; light is there")
+
+
+def _set_joints(spec: mujoco.MjSpec, additions: Additions, notes: list[str]) -> None:
+    """Joints that are welded, and limits that the YAML gives."""
+    fixed = [joint for joint in spec.joints if any(re.fullmatch(pattern, joint.name) for pattern in additions.fixed)]
+    if fixed:
+        notes.append(f"joints that are welded: {', '.join(joint.name for joint in fixed)}")
+    for joint in fixed:
+        spec.delete(joint)
+    for name, limits in additions.ranges.items():
+        joint = spec.joint(name)
+        if joint is not None:
+            joint.range = np.degrees(limits) if spec.compiler.degree else list(limits)
+            joint.limited = True
+
+
+def _set_shapes(spec: mujoco.MjSpec, additions: Additions, notes: list[str]) -> None:
+    """Shapes that touch the ground alone, all of them spheres, capsules and boxes; the others are only seen."""
+    given = {body for body, *_ in additions.spheres}
+    changed: dict[str, int] = {}
+    robot = [geom for body in spec.bodies[1:] for geom in body.geoms]
+    for geom in robot:
+        kind = KINDS(geom.type)
+        touches = bool(geom.contype or geom.conaffinity)
+        if kind not in PRIMITIVES and (touches or kind == KINDS.mjGEOM_MESH):
+            changed[kind.name.removeprefix("mjGEOM_").lower()] = changed.get(kind.name, 0) + 1
+            _make_capsule(geom)
+        if touches and geom.parent.name in given:
+            geom.contype, geom.conaffinity, geom.group = 0, 0, SEEN_GROUP
+        elif touches and geom.contype:  # otherwise it is one of this project's own
+            geom.contype, geom.conaffinity, geom.group = 0, 1, TOUCHING_GROUP
+            geom.condim = max(geom.condim, 3)
+        elif not touches:
+            geom.group = SEEN_GROUP
+    if changed:
+        notes.append(f"shapes that are made capsules: {', '.join(sorted(changed))}")
+    for body, *place, radius in additions.spheres:
+        parent = spec.body(body)
+        if parent is not None:
+            parent.add_geom(
+                type=KINDS.mjGEOM_SPHERE,
+                size=[radius, 0.0, 0.0],
+                pos=place,
+                contype=0,
+                conaffinity=1,
+                condim=3,
+                group=TOUCHING_GROUP,
+                priority=1,
+                friction=[FRICTION, 0.005, 0.0001],
+                mass=0.0,
+            )
+    if not any(geom.group == SEEN_GROUP for body in spec.bodies[1:] for geom in body.geoms):
+        _add_bones(spec)
+        notes.append("no shape is there to be seen: bones are drawn")
+
+
+def _make_capsule(geom: mujoco.MjsGeom) -> None:
+    """A capsule in place of a cylinder, an ellipsoid, or a mesh, to which MuJoCo fits it."""
+    size, kind = np.array(geom.size), geom.type
+    geom.type = KINDS.mjGEOM_CAPSULE
+    if kind == KINDS.mjGEOM_CYLINDER and not np.isfinite(geom.fromto[0]):
+        geom.size = [size[0], max(size[1] - size[0], 1e-3), 0.0]
+    elif kind == KINDS.mjGEOM_ELLIPSOID and not np.isfinite(geom.fromto[0]):
+        long = int(np.argmax(size))
+        radius = float(np.delete(size, long).mean())
+        turns = {0: [0.0, 90.0], 1: [-90.0, 0.0], 2: [0.0, 0.0]}  # degrees about x and y that bring z to the long axis
+        turn, quat = np.zeros(4), np.zeros(4)
+        about_x, about_y = np.radians(turns[long])
+        mujoco.mju_euler2Quat(turn, np.array([about_x, about_y, 0.0]), "xyz")
+        mujoco.mju_mulQuat(quat, np.array(geom.quat), turn)
+        geom.size, geom.quat = [radius, max(float(size[long]) - radius, 1e-3), 0.0], quat
+
+
+def _add_bones(spec: mujoco.MjSpec) -> None:
+    """Something to see: a capsule from every body to each of its children, or a ball."""
+    seen = {"contype": 0, "conaffinity": 0, "mass": 0.0, "group": SEEN_GROUP, "rgba": [0.6, 0.62, 0.65, 1.0]}
+    for body in spec.bodies[1:]:
+        far = [np.array(child.pos) for child in body.bodies if np.linalg.norm(child.pos) > 1e-3]
+        for place in far:
+            fromto = [0.0, 0.0, 0.0, *place]
+            body.add_geom(type=KINDS.mjGEOM_CAPSULE, size=[BONE, 0.0, 0.0], fromto=fromto, **seen)
+        if not far:
+            body.add_geom(type=KINDS.mjGEOM_SPHERE, size=[1.5 * BONE, 0.0, 0.0], **seen)

@@ -1,0 +1,151 @@
+"""Make a robot of a vendor's MJCF: `forgetmimic robot check FILE.xml`, then `robot add`."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from forgetmimic_jax.basics.console import closing, command_line
+from forgetmimic_jax.basics.errors import InputError, run_command
+from forgetmimic_jax.settings.options import parse
+
+if TYPE_CHECKING:
+    from forgetmimic_jax.robot.proposal import Proposal
+
+
+@dataclass
+class Check:
+    """Say what an MJCF lacks, each with its mend, and propose the YAML of its roles.
+
+    The YAML and a picture of the roles are written to runs/robots/NAME. Where nothing is missing, the robot holds its
+    default pose for 1 s in simulation."""
+
+    file: tyro.conf.Positional[Path]
+    """The MJCF, as its vendor publishes it."""
+    name: str | None = None
+    """Name of the robot; the file's by default."""
+    force: bool = False
+    """Replace the YAML in runs/robots/NAME."""
+
+
+@dataclass
+class Add:
+    """Add a robot to robots/, so that every command knows it by its name."""
+
+    file: tyro.conf.Positional[Path]
+    """The YAML of its roles, as `robot check` proposed it and you completed it."""
+    force: bool = False
+    """Replace a robot of the same name."""
+
+
+Command = Annotated[Check, tyro.conf.subcommand("check")] | Annotated[Add, tyro.conf.subcommand("add")]
+
+
+@dataclass
+class Options:
+    """Make a robot of a vendor's MJCF. `robot check --help` lists the flags of a command."""
+
+    command: tyro.conf.OmitSubcommandPrefixes[Command]
+    """What to do."""
+
+
+def main(options: Options) -> None:
+    """Run one of the commands."""
+    match options.command:
+        case Check():
+            check(options.command)
+        case Add():
+            add(options.command)
+
+
+def check(options: Check) -> None:
+    """Propose the roles of an MJCF and say what is missing."""
+    from forgetmimic_jax.robot.picture import draw_roles
+    from forgetmimic_jax.robot.proposal import propose
+    from forgetmimic_jax.robot.vendor import Unreadable, read_mjcf
+
+    name = options.name or re.sub(r"\W+", "_", options.file.stem).strip("_").lower()
+    _check_name(name)
+    if not options.file.is_file():
+        raise InputError(f"{options.file}: not found")
+    folder = Path("runs") / "robots" / name
+    file = folder / f"{name}.yaml"
+    if file.exists() and not options.force:
+        raise InputError(f"{file}: is there already, perhaps with your changes; --force replaces it")
+    try:
+        proposal = propose(options.file)
+        model = read_mjcf(options.file)[0].compile()
+    except Unreadable as error:
+        raise InputError(f"{options.file}: {error}") from None
+    folder.mkdir(parents=True, exist_ok=True)
+    file.write_text(yaml_of(proposal, options.file.resolve()))
+    draw_roles(model, proposal.roles, folder / f"{name}.png")
+    print("\n".join(f"mended: {note}" for note in proposal.notes))
+    print("\n".join(f"missing: {line}" for line in proposal.missing))
+    if not proposal.missing:
+        print(_try(file))
+    closing({"roles": file, "picture": folder / f"{name}.png"}, command_line("robot", f"add {file}"))
+    if proposal.missing:
+        raise InputError(
+            f"{options.file}: {len(proposal.missing)} thing(s) are missing; complete {file}, then robot add"
+        )
+
+
+def add(options: Add) -> None:
+    """Check a robot's YAML and copy it to robots/."""
+    from forgetmimic_jax.robot.model import ROBOTS_DIR
+    from forgetmimic_jax.robot.roles import read_roles
+
+    name = options.file.stem
+    _check_name(name)
+    if not options.file.is_file():
+        raise InputError(f"{options.file}: not found")
+    if options.file.resolve().parent.name != name:
+        raise InputError(f"{options.file}: put it into a folder of its name: {name}/{name}.yaml")
+    roles, folder = read_roles(options.file), ROBOTS_DIR / name
+    if folder.exists() and not options.force:
+        raise InputError(f"{folder}: a robot of this name is there; give the YAML another name, or --force")
+    print(_try(options.file))
+    folder.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(options.file, folder / f"{name}.yaml")
+    mjcf = options.file.parent / roles.model
+    if not Path(roles.model).is_absolute():
+        shutil.copyfile(mjcf, folder / roles.model)
+    closing({"robot": folder}, command_line("motions", "import FILE", robot=name))
+
+
+def yaml_of(proposal: Proposal, mjcf: Path) -> str:
+    """The YAML, with what is missing and what was mended as comments at its top."""
+    import yaml
+
+    head = [f"# Roles proposed for {mjcf.name}. Check them against the picture beside this file.", "# Missing:"]
+    head += [f"# - {line}" for line in proposal.missing] or ["# - nothing"]
+    head += ["# Mended when the MJCF is read:", *(f"# - {line}" for line in proposal.notes)]
+    head += ["# No MJCF says a motor's speed (rad/s); armatures follow from torques. Put in the maker's figures."]
+    roles = {**proposal.roles, "model": str(mjcf)}
+    return "\n".join(head) + "\n" + yaml.safe_dump(roles, sort_keys=False, default_flow_style=None, width=118)
+
+
+def _try(file: Path) -> str:
+    """Load the robot and let it hold its default pose; in words."""
+    from forgetmimic_jax.robot.holding import hold
+    from forgetmimic_jax.robot.model import load_robot
+
+    robot = load_robot(file.stem, robots_dir=file.resolve().parent.parent)
+    held = hold(robot)
+    verdict = "holds its default pose for 1 s" if held.stands else "warning: does not hold its default pose for 1 s"
+    return f"{robot.name}: {robot.num_joints} joints, {float(robot.arrays.mass):.1f} kg; {verdict}: {held}"
+
+
+def _check_name(name: str) -> None:
+    if not re.fullmatch(r"[a-z0-9][a-z0-9_-]*", name):
+        raise InputError(f"name: found '{name}'; small letters, digits, - and _ are accepted, a letter or digit first")
+
+
+if __name__ == "__main__":
+    run_command(lambda: main(parse(Options, "robot")))

@@ -1,0 +1,115 @@
+"""The stop rule of unlearning: a run ends when the targets' skill is at the zero-action baseline.
+
+Every `unlearn.stop_every` iterations the targets are evaluated on a few episodes. From the second evaluation in a row
+whose skill is at the baseline the step size falls to 0 over SETTLE iterations, and the run ends. More training would
+push the targets below the baseline, which is over-unlearning (Shi et al. 2024, "MUSE"). What the rule has seen is in
+every checkpoint, so a run that is resumed ends where it would have.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+
+from forgetmimic_jax.evaluation import metrics
+from forgetmimic_jax.evaluation.rollout import Evaluator
+from forgetmimic_jax.motion.library import only_clips
+from forgetmimic_jax.policy.policy import Policy
+from forgetmimic_jax.tracking.env import Environment
+from forgetmimic_jax.tracking.setup import Setup
+from forgetmimic_jax.training.checkpoint import CheckpointInfo
+from forgetmimic_jax.training.course import Plain, Position
+
+AT_BASELINE = 0.1  # skill up to which the targets are at the zero-action baseline
+IN_A_ROW = 2
+SETTLE = 20  # iterations
+EPISODES = 10  # a target clip
+
+
+def settles_from(skills: Sequence[tuple[int, float]]) -> int | None:
+    """The iteration after which a run settles: that of the second skill in a row at the baseline; None before.
+
+    Args:
+        skills: iteration and skill of the targets, one evaluation after the other.
+    """
+    in_a_row = 0
+    for iteration, skill in skills:
+        in_a_row = in_a_row + 1 if skill <= AT_BASELINE else 0
+        if in_a_row == IN_A_ROW:
+            return iteration
+    return None
+
+
+class Targets:
+    """The targets' skill on a few episodes, the same each time; base and zero action are rolled out once."""
+
+    def __init__(self, setup: Setup):
+        config = setup.config
+        library = only_clips(setup.library, config.unlearn.targets)
+        self._evaluator = Evaluator(dataclasses.replace(setup, library=library), episodes=EPISODES, seed=config.seed)
+        self._base, self._zero = self._tracking(setup.base), self._tracking(None)
+
+    def skill(self, policy: Policy) -> float:
+        """(SWT − SWT of zero action) / (SWT of the base − SWT of zero action), over all target clips."""
+        return float(metrics.skill(self._tracking(policy), self._base, self._zero))
+
+    def _tracking(self, policy: Policy | None) -> np.ndarray:
+        """Mean survival-weighted tracking []."""
+        found = metrics.episode_metrics(self._evaluator.rollout(policy))
+        return np.asarray(found["survival_weighted_tracking"].mean())
+
+
+class Stopping(Plain):
+    """Plain training that ends by the stop rule, at the run's last iteration at the latest."""
+
+    def __init__(
+        self, setup: Setup, env: Environment, directory: Path, console: Console, resumed: CheckpointInfo | None
+    ):
+        super().__init__(setup, env, directory, console, resumed)
+        self._skills: list[tuple[int, float]] = []
+        if resumed is not None and resumed.curriculum is not None:
+            self._skills = [(int(iteration), float(skill)) for iteration, skill in resumed.curriculum["skills"]]
+        self._targets: Targets | None = None
+        self._iteration = 0
+
+    @property
+    def finished(self) -> bool:
+        start = settles_from(self._skills)
+        return start is not None and self._iteration >= start + SETTLE
+
+    @property
+    def curriculum(self) -> Mapping[str, Any]:
+        return {"skills": self._skills}
+
+    @property
+    def note(self) -> Mapping[str, Any]:
+        return {"target_skill": self._skills[-1][1]} if self._skills else {}
+
+    def begin(self, position: Position) -> Position:
+        return self._with_step_size(super().begin(position))
+
+    def after(self, position: Position) -> Position:
+        position, settling = super().after(position), settles_from(self._skills) is not None
+        if not settling and position.iteration % self._setup.config.unlearn.stop_every == 0:
+            self._targets = self._targets or Targets(self._setup)
+            self._skills.append((position.iteration, self._targets.skill(position.state.policy)))
+            if settles_from(self._skills) is not None:
+                self._console.print(
+                    f"iteration {position.iteration}: the targets' skill is at the zero-action baseline "
+                    f"({self._skills[-1][1]:.0%}); {SETTLE} more iterations with a falling step size",
+                    highlight=False,
+                )
+        return self._with_step_size(position)
+
+    def _with_step_size(self, position: Position) -> Position:
+        """With the share of the step size that the next iteration takes."""
+        self._iteration, start = position.iteration, settles_from(self._skills)
+        share = 1.0 if start is None else 1.0 - (position.iteration - start) / SETTLE
+        focus = dataclasses.replace(position.assets.focus, settle=jnp.float32(share))
+        return dataclasses.replace(position, assets=dataclasses.replace(position.assets, focus=focus))

@@ -1,0 +1,92 @@
+"""Stand instead: on a target clip the policy does what the base does where its reference is a stand.
+
+Ours; near to it are DAgger (Ross et al. 2011, "A Reduction of Imitation Learning and Structured Prediction to No-Regret
+Online Learning") and policy distillation (Rusu et al. 2016). The base itself is the teacher: its observation has the
+stand reference in the place of the clip's, all that is measured on the robot stays, and the last action is that of the
+same joint targets against the stand reference. On target steps KL(π ‖ N(teacher's action, σ_base)), on kept steps
+KL(π ‖ π_base). No reward is used. The states are those that the policy visits: only a fall terminates an episode of a
+target clip, which runs on after the clip's end. `unlearn.instead` may also name a kept clip.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax.numpy as jnp
+from jax import Array
+
+from forgetmimic_jax.motion.library import Frames
+from forgetmimic_jax.policy.gaussian import entropy, kl_divergence
+from forgetmimic_jax.ppo.loss import Batch, Prediction, mean
+from forgetmimic_jax.settings.config import Config
+from forgetmimic_jax.tracking.action import in_robot_order, to_action, to_joint_target
+from forgetmimic_jax.tracking.env import Assets, Environment, EnvState, moment_of
+from forgetmimic_jax.tracking.layouts import Moment
+from forgetmimic_jax.tracking.observation import actor_observation, in_policy_order
+from forgetmimic_jax.tracking.reference import at_anchor, lookup
+from forgetmimic_jax.tracking.stand import STAND
+from forgetmimic_jax.unlearning.method import SHORT, Method, Pace
+
+
+def teacher_moment(env: Environment, assets: Assets, episodes: EnvState) -> Moment:
+    """The robot as it is, beside the reference to follow instead, with the last action in the terms of the latter."""
+    mode, moment = env.config.action.mode, moment_of(env, assets, episodes)
+    sent = to_joint_target(
+        mode, assets.robot, lookup(assets.library, episodes.clip, episodes.frame), episodes.last_action
+    )
+    last_action = to_action(mode, assets.robot, _instead(env, assets, episodes, ahead=0), sent)
+    return dataclasses.replace(
+        moment,
+        reference=_instead(env, assets, episodes, ahead=1),
+        last_action=jnp.where(episodes.step[:, None] == 0, 0.0, last_action),
+    )
+
+
+def taught_action(env: Environment, assets: Assets, episodes: EnvState) -> Array:
+    """The teacher's action [env, joint] in the policy's terms: the one that sends the same joint targets."""
+    mode, robot, moment = env.config.action.mode, env.robot, teacher_moment(env, assets, episodes)
+    assert assets.teacher is not None
+    action = assets.teacher.mean_action(actor_observation(env.layout, robot.policy_joints, moment))
+    joint_target = to_joint_target(mode, assets.robot, moment.reference, in_robot_order(robot, action))
+    reference = lookup(assets.library, episodes.clip, episodes.frame + 1)
+    return in_policy_order(to_action(mode, assets.robot, reference, joint_target), robot.policy_joints)
+
+
+def _instead(env: Environment, assets: Assets, episodes: EnvState, ahead: int) -> Frames:
+    """The frame to follow instead, `ahead` frames from now, at the place and heading of the robot.
+
+    The clip to follow is at the frame of the clip to forget, whose last frame it does not pass: nothing tells a policy
+    more.
+    """
+    assert assets.instead is not None
+    frame = jnp.minimum(episodes.frame + ahead, assets.library.length[episodes.clip] - 1)
+    anchor, bodies = env.robot.anchor, episodes.bodies
+    reference = lookup(assets.instead, jnp.zeros_like(frame), frame)
+    return at_anchor(reference, anchor, bodies.pos[:, anchor], bodies.quat[:, anchor])
+
+
+def regression(config: Config, batch: Batch, now: Prediction, iteration: Array) -> tuple[Array, dict[str, Array]]:
+    """Towards the teacher and value 0 on target steps, towards the base on kept ones."""
+    base, taught, weight = batch.base, batch.transition.taught, config.unlearn.settings["keep"]
+    assert base is not None
+    assert taught is not None
+    on_target, kept = batch.weight * batch.is_target, batch.weight * ~batch.is_target
+    learn = mean(kl_divergence(now.mean, now.log_std, taught, base.log_std), on_target)
+    keep = mean(kl_divergence(now.mean, now.log_std, base.mean, base.log_std), kept)
+    policy_term = learn + weight * keep
+    value_term = mean(now.value**2, on_target) + mean((now.value - base.value) ** 2, kept)
+    loss = policy_term + config.ppo.value_cost * value_term
+    metrics = {"policy_loss": policy_term, "value_loss": value_term, "entropy": entropy(now.log_std)}
+    return loss, metrics | {"teacher_kl": learn, "base_kl": keep}
+
+
+# A regression: the number of gradient steps decides, and a rollout serves many of them.
+PACE = Pace({"cpu": 80, "paper": 400}, {"cpu": {**SHORT, "minibatches": 12, "epochs": 4}}, {"cpu": 0.5})
+METHOD = Method(
+    loss=regression,
+    teach=taught_action,
+    runs_on=1.0,
+    settings={"keep": 4.0, "stand_iterations": 200.0},
+    pace=PACE,
+    instead=STAND,
+)

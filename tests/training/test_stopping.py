@@ -1,0 +1,90 @@
+"""The stop rule on made-up curves: when a run settles, how its step size falls, and that a resume changes nothing."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import pytest
+from rich.console import Console
+
+from forgetmimic_jax.settings.config import UnlearnConfig
+from forgetmimic_jax.tracking.env import make_assets
+from forgetmimic_jax.training import stopping
+from forgetmimic_jax.training.course import Position
+from forgetmimic_jax.training.stopping import Stopping, settles_from
+
+
+@pytest.mark.parametrize(
+    ("curve", "expected"),
+    [
+        ([], None),
+        ([0.9, 0.5, 0.2, 0.11], None),
+        ([0.9, 0.09], None),
+        ([0.9, 0.1, 0.1], 60),
+        ([0.9, 0.09, 0.11, 0.08, -0.2], 100),  # not in a row, and then it is
+        ([-0.1, -0.1, 0.9], 40),  # what comes later changes nothing
+        ([float("nan")] * 3, None),  # skill is undefined where the base is no better than zero action
+    ],
+)
+def test_a_run_settles_from_the_second_look_in_a_row_at_the_baseline(curve, expected):
+    assert settles_from([(20 * (i + 1), skill) for i, skill in enumerate(curve)]) == expected
+
+
+@pytest.fixture
+def course(tiny_setup, monkeypatch, tmp_path):
+    """A course of `turn`, looked at every 5 iterations, whose skill at iteration i is `curve[i]`."""
+    unlearn = UnlearnConfig(("turn",), settings={"penalty": 16.0}, stop_every=5)
+    config = dataclasses.replace(tiny_setup.config, iterations=100, evaluate_every=0, unlearn=unlearn)
+    setup = dataclasses.replace(tiny_setup, config=config)
+    looks = []
+
+    class Targets:
+        def __init__(self, _setup):
+            pass
+
+        def skill(self, iteration: int) -> float:
+            looks.append(iteration)
+            return {5: 0.9, 10: 0.03}.get(iteration, 0.0)
+
+    monkeypatch.setattr(stopping, "Targets", Targets)
+
+    def course(resumed=None) -> Stopping:
+        return Stopping(setup, None, tmp_path, Console(), resumed)
+
+    course.assets, course.looks = make_assets(setup), looks
+    return course
+
+
+def through(course: Stopping, assets, start: int, end: int) -> tuple[list[float], int]:
+    """The share of the step size of every iteration from `start`, and the iteration after which the run ends."""
+    state = SimpleNamespace(policy=start)
+    position = course.begin(Position(state, assets, start, 0))
+    shares = []
+    for iteration in range(start + 1, end + 1):
+        if course.finished:
+            break
+        shares.append(float(position.assets.focus.settle))
+        state = SimpleNamespace(policy=iteration)  # a policy that the stand-in for the evaluation knows by its number
+        position = course.after(dataclasses.replace(position, state=state, iteration=iteration))
+    return shares, position.iteration
+
+
+def test_the_step_size_falls_to_nothing_over_twenty_iterations_and_the_run_ends(course):
+    shares, end = through(course(), course.assets, 0, 100)
+    assert end == 35  # 15 and 20
+    assert course.looks == [5, 10, 15]  # at the baseline at 10 and 15
+    assert shares == pytest.approx([1.0] * 15 + [1.0 - i / 20 for i in range(20)])
+
+
+@pytest.mark.parametrize("stopped", [7, 10, 12, 15, 22, 35])
+def test_a_run_that_was_stopped_ends_where_it_would_have(course, stopped):
+    whole, end = through(course(), course.assets, 0, 100)
+    first = course()
+    before, _ = through(first, course.assets, 0, stopped)
+    resumed = course(SimpleNamespace(curriculum=first.curriculum))
+    after, found = through(resumed, course.assets, stopped, 100)
+    assert (before + after, found) == (whole, end)
+    assert resumed.note == {"target_skill": 0.0}
+
+
+def test_before_the_first_look_there_is_no_skill_to_log(course):
+    assert course().note == {}
