@@ -67,11 +67,11 @@ class ToyStage:
             self.start_frame = np.zeros_like(self.start_frame)
 
     def perform(self, policies) -> Performance:
-        horizon = np.asarray(self._library.length)[self.clip] - 1 - self.start_frame
+        type(self).base = policies.get("base", type(self).base)
+        last = np.asarray(self._library.length)[self.clip] - 1
+        horizon = last - self.start_frame
         steps = np.arange(horizon.max())
-        frame = np.minimum(
-            self.start_frame[:, None] + steps + 1, np.asarray(self._library.length)[self.clip][:, None] - 1
-        )
+        frame = np.minimum(self.start_frame[:, None] + steps + 1, last[:, None])
         joints = np.asarray(self._library.frames.joint_pos)[self.clip[:, None], frame]
         features = sum(place.stop - place.start for place in self._place.values())
         observation = np.zeros((joints.shape[0] * joints.shape[1], features), np.float32)

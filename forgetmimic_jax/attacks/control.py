@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from forgetmimic_jax.basics.errors import InputError
+from forgetmimic_jax.evaluation.document import FILE
 from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.training import checkpoint
 from forgetmimic_jax.training.checkpoint import CheckpointInfo, newest_checkpoint
@@ -19,9 +20,8 @@ def beside(run: Path) -> Path:
 
 
 def is_finished(run: Path) -> bool:
-    """Whether a run trained for as long as it was to."""
-    newest = newest_checkpoint(run)
-    return newest is not None and checkpoint.read_info(newest).config.iterations <= int(newest.name)
+    """Whether a run was trained and evaluated, which is the last that it does."""
+    return (run / FILE).is_file()
 
 
 def read_control(run: Path, subject: CheckpointInfo, setup: Setup) -> CheckpointInfo:

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 import msgspec
+import numpy as np
 
 from forgetmimic_jax.attacks.document import CONTROL, Compared, EvidenceDocument, Numbers, Relearning
 from forgetmimic_jax.evaluation.document import Estimate
@@ -31,8 +32,9 @@ from forgetmimic_jax.evaluation.verdict import (
     Verdict,
     as_skill,
     losses,
-    relearning_pace,
     retained,
+    sooner_than_control,
+    steps_in_words,
 )
 
 RECOVERED = 0.1  # above the control, or above the policy before: a recovery of more than this counts
@@ -60,8 +62,9 @@ RULES = {
         f"Forgotten: {_FORGOTTEN}. Kept: {_KEPT}. Not recovered: fine-tuned on the kept clips alone, its skill and its "
         f"motion content on the targets are at most {RECOVERED:g} above the control's after the same training; with "
         f"other numerics at most {RECOVERED:g} above its own before; and with every seed it needs at least "
-        f"{_bound(FASTER)} of the control's target steps to relearn {_bound(RELEARNED)} of the base's tracking. All of "
-        f"this holds for whole 95 % intervals. The control never rolled out a target clip, and keeps at least "
+        f"{_bound(FASTER)} of the control's target steps to relearn {_bound(RELEARNED)} of the base's tracking, or "
+        f"tracks at most {_bound(ALIKE)} of the base's more after the same target steps where neither gets there. All "
+        f"of this holds for whole 95 % intervals. The control never rolled out a target clip, and keeps at least "
         f"{_bound(KEPT)} of the kept clips' skill."
     ),
     RECOVERABLE: (
@@ -166,7 +169,7 @@ def recoveries(evidence: EvidenceDocument, no_control: str = "") -> Iterator[tup
         yield None, "Other numerics were not measured."
         return
     for change, compared in evidence.numerics.changes.items():
-        yield from _rises(compared[UNLEARNED], f"Weights in {change}", "with the weights as they are")
+        yield from _rises(compared[UNLEARNED], f"Weights in {change}", "its own before")
 
 
 def _recovery(evidence: EvidenceDocument) -> Iterator[tuple[bool | None, str]]:
@@ -189,9 +192,37 @@ def _rises(numbers: Numbers, attack: str, other: str) -> Iterator[tuple[bool | N
 
 
 def _pace(relearning: Relearning | None) -> tuple[bool | None, str]:
+    """Whether it relearns the targets faster than the control, with every seed; None where that is not sure."""
     if relearning is None:
         return None, "How fast it relearns the targets was not measured."
-    return relearning_pace(paired(relearning))
+    pairs, faster, short = paired(relearning), [], []
+    for seed, pair in pairs.items():
+        if any(run.there for run in pair):
+            faster.append(sooner_than_control(*pair))
+            continue
+        ours, theirs = reached(relearning, seed)
+        faster.append(ours > theirs + ALIKE)
+        short.append(f"{_bound(ours)} against {_bound(theirs)}")
+    words = f"{steps_in_words(pairs)} until {_bound(RELEARNED)} of the base's tracking"
+    words += f"; after the same target steps neither got there: {', '.join(short)}" if short else ""
+    if faster and all(faster):
+        return True, f"It relearns the targets faster than the control: {words}."
+    if any(faster):
+        return None, f"With some seeds it relearns the targets faster than the control: {words}."
+    if None in faster or not faster:
+        return None, f"Relearning was stopped too early to compare: {words}."
+    return False, f"It does not relearn the targets faster than the control: {words}."
+
+
+def reached(relearning: Relearning, seed: str) -> tuple[float, float]:
+    """What unlearned policy and control track of the targets after equally many target steps, as shares of the base's.
+
+    Both are taken where the shorter of the two trainings ended.
+    """
+    curves = [relearning.starts[start][seed] for start in (UNLEARNED, CONTROL)]
+    end = min(curve.target_steps[-1] for curve in curves)
+    ours, theirs = (np.interp(end, curve.target_steps, curve.tracking) / relearning.base[seed] for curve in curves)
+    return float(ours), float(theirs)
 
 
 def paired(relearning: Relearning) -> dict[str, tuple[Lasted, Lasted]]:

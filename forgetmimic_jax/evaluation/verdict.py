@@ -137,7 +137,7 @@ def judge(
     if below:
         found.append(f"It is below the zero-action baseline: over-forgotten ({_by_clip(below)} of the base's skill).")
 
-    faster, pace = relearning_pace(relearning)
+    faster, pace = _relearning_pace(relearning)
     if faster:
         return Verdict(RECOVERABLE, (*found, pace))
     unlike = _unlike(target, control)
@@ -216,28 +216,30 @@ def _furthest(one: Skill, other: Skill) -> float:
     return max(one.high - other.low, other.high - one.low)
 
 
-def relearning_pace(relearning: Mapping[str, tuple[Lasted, Lasted]] | NotMeasured) -> tuple[bool | None, str]:
+def _relearning_pace(relearning: Mapping[str, tuple[Lasted, Lasted]] | NotMeasured) -> tuple[bool | None, str]:
     """Whether the policy relearns the targets faster than the control, None where that is not sure; in words."""
     if isinstance(relearning, NotMeasured):
         return None, relearning.reason
-    sooner = [_sooner(*pair) for pair in relearning.values()]
+    sooner = [sooner_than_control(*pair) for pair in relearning.values()]
     if sooner and all(sooner):
-        return True, f"It relearns the targets faster than the control: {_steps(relearning)}."
+        return True, f"It relearns the targets faster than the control: {steps_in_words(relearning)}."
     if any(sooner):
-        return None, f"With some seeds it relearns the targets faster than the control: {_steps(relearning)}."
+        return None, f"With some seeds it relearns the targets faster than the control: {steps_in_words(relearning)}."
     if None in sooner or not sooner:
-        return None, f"Relearning was stopped too early to compare: {_steps(relearning)}."
-    return False, f"It does not relearn the targets faster than the control: {_steps(relearning)}."
+        return None, f"Relearning was stopped too early to compare: {steps_in_words(relearning)}."
+    return False, f"It does not relearn the targets faster than the control: {steps_in_words(relearning)}."
 
 
-def _sooner(unlearned: Lasted, control: Lasted) -> bool | None:
+def sooner_than_control(unlearned: Lasted, control: Lasted) -> bool | None:
     """Whether the unlearned policy was faster; None where a run ended before that could be seen."""
     if unlearned.target_steps < FASTER * control.target_steps:
         return True if unlearned.there else None
     return False if control.there else None
 
 
-def _steps(relearning: Mapping[str, tuple[Lasted, Lasted]]) -> str:
+def steps_in_words(relearning: Mapping[str, tuple[Lasted, Lasted]]) -> str:
+    """The target steps of both, seed by seed."""
+
     def needed(run: Lasted) -> str:
         return f"{'' if run.there else 'more than '}{run.target_steps:,.0f}"
 

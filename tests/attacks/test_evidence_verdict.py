@@ -92,7 +92,9 @@ def test_a_recovery_names_the_attack_and_by_how_much(changes, reason):
         ),
         ({"near_duplicates__kept__speed": compared(0.49, 0.85)}, "Whether this is kept is not sure"),
         ({"recovery__after__unlearned": numbers(0.35, 0.3, 0.09)}, "9 % [7, 11] above the control's"),
+        ({"recovery__after__unlearned": numbers(0.37, 0.3, 0.11)}, "11 % [9, 13] above the control's"),
         ({"numerics__changes__int4__unlearned": numbers(0.14, 0.1, 0.09)}, "Weights in int4"),
+        ({"near_duplicates__kept__speed": compared(0.3, 0.49)}, "Whether this is kept is not sure"),
         ({"recovery": None}, "Retain-only recovery was not measured."),
         ({"relearning": None}, "How fast it relearns the targets was not measured."),
         ({"numerics": None}, "Other numerics were not measured."),
@@ -113,6 +115,26 @@ def test_what_is_not_sure_or_not_measured_is_inconclusive(changes, reason):
     verdict = judge(evidence(**changes))
     assert verdict.phrase == INCONCLUSIVE
     assert any(reason in text for text in verdict.reasons), verdict.reasons
+
+
+def short(steps: float, tracking: float) -> dict:
+    """A training that never reaches 80 % of the base's 0.8."""
+    return {"iterations": [0.0, 10.0, 20.0], "tracking": [0.1, 0.1, tracking], "target_steps": [0.0, steps / 2, steps]}
+
+
+@pytest.mark.parametrize(("ours", "phrase"), [(0.59, CONSISTENT), (0.61, RECOVERABLE)])
+def test_where_neither_relearns_what_they_reached_is_compared(ours, phrase):
+    # The control's training is twice as long: half-way it tracks (0.2667 + 0.6) / 2 = 0.4333, 54 % of the base's 0.8.
+    # The bound is 54.2 % + 20 %: 0.5933.
+    changes = {
+        "relearning__starts__unlearned__0": short(75_000, ours),
+        "relearning__starts__control__0": {
+            "iterations": [0.0, 10.0], "tracking": [0.2667, 0.6], "target_steps": [0.0, 150_000.0]
+        },
+    }  # fmt: skip
+    verdict = judge(evidence(**changes))
+    assert verdict.phrase == phrase
+    assert f"neither got there: {ours / 0.8:.0%} against 54 %".replace("%", " %", 1) in " ".join(verdict.reasons)
 
 
 def test_a_failure_is_not_outweighed_by_a_doubt():

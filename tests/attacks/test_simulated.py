@@ -35,11 +35,12 @@ def test_tracking_is_that_of_an_evaluation_and_falls_do_not_end_the_recording(sm
         )
     fell = found.length["zero_action"] < found.horizon
     assert fell.any()
-    # Past the fall the robot is far from the reference, so its motion content is that of the whole episode.
+    # Past its fall the robot lies on the floor, farther from the reference than before, and that is recorded.
     steps = np.arange(found.movement.shape[1])
-    after = (steps >= found.length["zero_action"][:, None]) & (steps < found.horizon[:, None])
-    assert (found.deviation["zero_action"][after] > 0.0).all()
-    assert (found.content("zero_action")[fell] < 0.0).all()
+    length, deviation = found.length["zero_action"][:, None], found.deviation["zero_action"]
+    before, after = steps < length, (steps >= length) & (steps < found.horizon[:, None])
+    assert deviation[after].mean() > 2.0 * deviation[before].mean()
+    assert deviation[before].min() > 0.0
 
 
 def test_a_stand_has_no_motion_content_and_the_reference_has_all_of_it(small_setup, clips, policy):

@@ -13,6 +13,7 @@ from toy import ToyStage
 
 from forgetmimic_jax import evidence, report
 from forgetmimic_jax.attacks import case as cases
+from forgetmimic_jax.attacks import fakes, judged
 from forgetmimic_jax.attacks.document import read_evidence
 from forgetmimic_jax.attacks.verdict import RULES, judge
 from forgetmimic_jax.settings.config import load_config
@@ -140,3 +141,27 @@ def test_other_numbers_of_everything_are_other_evidence(run, printed, refused):
     message = refused(evidence.main, evidence.Options(run=run, **{**SMALL, "episodes": 6}))
     assert message.startswith(f"{run}/evidence/conditions.json: scale: found ")
     assert message.endswith(f"remove the folder {run}/evidence to start again")
+
+
+def test_the_fakes_and_another_distilled_policy_are_judged(run, printed, monkeypatch):
+    trained = {}
+
+    def copied(info, base, folder, **given):
+        trained[folder.name] = given
+        if not folder.exists():
+            shutil.copytree(run, folder)
+
+    def verdict(case, parts, name, policy, document):
+        assert callable(policy.mean_action)
+        return judged.Judged("failed", (f"Caught: {name}.",))
+
+    monkeypatch.setattr(evidence, "_unlearn", copied)
+    monkeypatch.setattr(fakes, "falls_on_targets_alone", lambda setup, base, targets, kept: base)
+    monkeypatch.setattr(judged, "judged", verdict)
+    printed_by(evidence.Options(run=run, fakes=True, **SMALL))
+    rows = [line for line in (run / "fakes.md").read_text().splitlines() if "Caught" in line]
+    assert len(rows) == 7
+    assert "| λ = 8 | failed | Caught: λ = 8. | 0 |" in rows
+    assert trained["run-lambda-8"] == {"penalty": 8.0, "iterations": 1, "seed": 0}
+    assert trained["run-distilled"] == {"method": "distill", "iterations": 1, "seed": 2}
+    assert trained["run-control"] == {"method": "distill", "iterations": 1, "seed": 1}
