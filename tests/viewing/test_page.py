@@ -6,7 +6,6 @@ import shutil
 import socket
 import sys
 import threading
-import time
 from collections.abc import Iterator
 
 import msgspec
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 import viser
 from PIL import Image
+from waiting import until
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
@@ -185,11 +185,6 @@ def read(connection: ClientConnection) -> None:
     with contextlib.suppress(ConnectionClosed):
         while True:
             connection.recv()
-
-
-def until(true) -> None:
-    while not true():
-        time.sleep(0.02)
 
 
 def test_each_browser_has_a_simulation_and_one_that_vanishes_ends_its_own(server, monkeypatch):
