@@ -42,6 +42,7 @@ def main(options: Options) -> None:
     """Evaluate, write the files and print the table."""
     from forgetmimic_jax.basics.console import closing
     from forgetmimic_jax.evaluation.evaluate import evaluate, show_and_write
+    from forgetmimic_jax.training.checkpoint import read_info
     from forgetmimic_jax.training.comparison import load_comparison
     from forgetmimic_jax.training.folder import check_writable, folder_of
     from forgetmimic_jax.training.start import base_folder
@@ -59,7 +60,7 @@ def main(options: Options) -> None:
         library=options.library,
         physics=options.physics,
     )
-    setup, path = compared.setup, compared.path
+    setup, path = compared.setup, read_info(path).path
     document = evaluate(
         setup,
         compared.subjects,

@@ -23,6 +23,7 @@ import yaml
 
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.exchange.onnx_actor import ACTION_MODES
+from forgetmimic_jax.motion.converting import breadth_first
 from forgetmimic_jax.robot.model import Robot
 from forgetmimic_jax.tracking.layouts import LAYOUTS, UNSUPPORTED
 
@@ -183,16 +184,6 @@ def from_flags(layout: str | None, mode: str | None, order: Literal["robot", "is
     if mode is not None:
         facts["action_mode"] = mode
     return facts
-
-
-def breadth_first(robot: Robot) -> tuple[str, ...]:
-    """The joints in Isaac Lab's order: those of all bodies of one depth in the tree before those of the next."""
-    model = robot.model
-    depth = [0] * model.nbody
-    for body in range(1, model.nbody):
-        depth[body] = depth[model.body_parentid[body]] + 1
-    bodies = {model.joint(name).name: int(model.joint(name).bodyid[0]) for name in robot.joint_names}
-    return tuple(sorted(robot.joint_names, key=lambda name: (depth[bodies[name]], bodies[name])))
 
 
 def _terms(content: Any, where: str) -> Facts:

@@ -30,11 +30,6 @@ class Comparison:
     targets: tuple[str, ...]  # clips to forget
 
     @property
-    def path(self) -> Path:
-        """The checkpoint that is evaluated or shown."""
-        return list(self.info.values())[-1].path
-
-    @property
     def subjects(self) -> dict[str, Subject]:
         """The policies as an evaluation takes them."""
         return {name: subject(policy, self.info[name]) for name, policy in self.policies.items()}
