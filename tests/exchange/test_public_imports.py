@@ -48,7 +48,7 @@ def test_joint_targets_are_those_of_the_policys_own_loop(name, files, robot, tin
         "wbc": lambda: from_config_yaml(file, file.with_name("config.yaml")),
     }[name]()
     foreign = read_policy(file, robot, 0.02, Reading())
-    clip = foreign.clip or read_motion(robot, samples / "M_ShortMove12.csv", MotionReading(fps=60.0))
+    clip = foreign.clip or read_motion(robot, samples / "M_ShortMove12.csv", MotionReading(fps=60.0)).clip
     setup = own_setup(foreign.config(tiny_config), [clip])
     policy = with_actor(fresh_policy(setup, make_assets(setup)), foreign.actor, 0.4)
     expected = in_its_own_loop(deployment, robot, setup.library, STEPS)
