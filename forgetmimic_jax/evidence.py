@@ -39,7 +39,7 @@ class Options:
     recovery_iterations: int | None = None
     """Iterations of the fine-tuning on the kept clips alone; 100 by default."""
     relearning_iterations: int | None = None
-    """Iterations of relearning at most; 300 by default."""
+    """Iterations of relearning at most; 200 by default, with --full 300."""
     control_iterations: int | None = None
     """Iterations of a control that is made; the method's by default."""
     fakes: bool = False
