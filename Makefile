@@ -11,6 +11,7 @@
 ## LIBRARY      folder of clips (default: data/ROBOT)
 ## BASE         the policy to start from (default: the shipped one; for pretrain and train, none)
 ## CHECKPOINT   the policy to evaluate, export, play or film (default: the shipped base)
+## BESIDE       more checkpoints to play or film beside it, comma-separated
 ## RUN          folder of the run to attack, or to report on
 ## OUTPUT       where the results go (default: under runs/)
 ## RESUME       1 continues the run in OUTPUT
@@ -34,7 +35,7 @@ STUDIES = validity comparison penalty heat_map motion_types physical_behaviour t
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help $(COMMANDS) sweep experiments tables test mutants lint format clean
+.PHONY: help $(COMMANDS) sweep experiments tables test mutants soak lint format clean
 
 help: ## this list
 	@echo 'make TARGET [VARIABLE=value ...]'
@@ -64,7 +65,7 @@ sweep: .venv/.installed ## several unlearning runs that differ in one thing, wit
 
 experiments: .venv/.installed ## run what is missing of the paper's studies (hours), then write their pages
 	@status=0; for study in $(STUDIES); do \
-		.venv/bin/python -m experiments.$$study $(strip $(ARGS) $(FLAGS)) || status=$$?; \
+		MUJOCO_GL=disable .venv/bin/python -m experiments.$$study $(strip $(ARGS) $(FLAGS)) || status=$$?; \
 		test $$status -lt 128 || break; \
 	done; .venv/bin/python -m experiments.claims; exit $$status
 
@@ -83,6 +84,9 @@ test: .venv/.installed ## run the tests
 
 mutants: .venv/.installed ## see which faults of one line the tests notice (half an hour; ARGS=--list names them)
 	.venv/bin/python tests/mutants.py $(ARGS)
+
+soak: .venv/.installed ## kill, fill and mutate: an hour of faults on purpose (ARGS=--help lists the parts)
+	.venv/bin/python tests/soak.py $(ARGS)
 
 lint: .venv/.installed ## check style, formatting and types
 	.venv/bin/ruff check .

@@ -6,6 +6,7 @@ import difflib
 import sys
 from collections.abc import Callable, Iterable
 
+from forgetmimic_jax.basics.drawing import draw_later
 from forgetmimic_jax.basics.signals import second_signal_ends
 
 
@@ -30,6 +31,7 @@ def run_command(command: Callable[[], None]) -> None:
     Exit codes: 2 for bad input or an operating system's refusal, 130 for Ctrl-C. A second Ctrl-C or SIGTERM waits for
     nothing.
     """
+    draw_later()
     try:
         with second_signal_ends():
             command()

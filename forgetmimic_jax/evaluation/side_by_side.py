@@ -33,7 +33,7 @@ from forgetmimic_jax.tracking.stand import low, stand_frame, tilted
 class Happened:
     """What happened to the robots in a control step, each [env]."""
 
-    falls: Values  # bool: the robot is low, or it is tilted where the clip is not, or the physics diverged
+    fallen: Values  # bool: the robot is low, or it is tilted where the clip is not, or the physics diverged
     impact: Values  # body weights, the floor's largest force on a body that is no foot
     impact_speed: Values  # m/s downward, of the root before such a force; 0 without
     head_contact: Values  # bool
@@ -109,7 +109,7 @@ def happened(robot: Robot, stand: Frames, result: StepResult) -> Happened:
     stand_there = align_to_anchor(stands, robot.anchor, clip.pos[:, robot.anchor], clip.quat[:, robot.anchor])
     outside = (joint_pos < robot.arrays.soft_lower) | (joint_pos > robot.arrays.soft_upper)
     return Happened(
-        falls=falls(robot, pair) | result.diverged,
+        fallen=fallen_unlike_clip(robot, pair) | result.diverged,
         impact=bodies.impact_force / robot.weight,
         impact_speed=bodies.impact_speed,
         head_contact=bodies.head_contact > 0,
@@ -127,7 +127,7 @@ def squared_distance(one: Array, other: Array) -> Array:
     return ((one - other) ** 2).sum(-1).mean(-1)
 
 
-def falls(robot: Robot, pair: Pair) -> Array:
+def fallen_unlike_clip(robot: Robot, pair: Pair) -> Array:
     """bool[env]: the robot is low, or it is tilted where the clip is not.
 
     A cartwheel or a high kick tilts the anchor by more than 60 degrees itself, which is no fall.

@@ -86,7 +86,7 @@ def episode_numbers(rollout: UnboundedRollout) -> dict[str, np.ndarray]:
     body but the feet touches the floor; `motion_content` and `attempt_rate` where the rest of the clip hardly moves.
     """
     happened = rollout.happened
-    steps = np.arange(happened.falls.shape[1])
+    steps = np.arange(happened.fallen.shape[1])
     during, of_clip = (steps < end[:, None] for end in (rollout.steps, rollout.horizon))
 
     def largest(values: np.ndarray) -> np.ndarray:
@@ -95,7 +95,7 @@ def episode_numbers(rollout: UnboundedRollout) -> dict[str, np.ndarray]:
     def mean(values: np.ndarray, where: np.ndarray = during) -> np.ndarray:
         return np.where(where, values, 0.0).sum(axis=1) / where.sum(axis=1)
 
-    falls = happened.falls & during
+    falls = happened.fallen & during
     upright = ~falls.any(axis=1)
     steps_to_fall = np.where(upright, rollout.steps, falls.argmax(axis=1) + 1)
     impact = largest(happened.impact)

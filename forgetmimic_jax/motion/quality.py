@@ -149,7 +149,8 @@ def measure(robot: Robot, clip: Clip, cycle_frames: int | None = None) -> Qualit
     missing = _means(missing_acceleration(robot, positions, qpos, clip.fps), MISSING_SECONDS, clip.fps)
     loads = _means(motor_loads(robot, points, positions, qpos, clip.fps), LOAD_SECONDS, clip.fps)
     speeds = np.abs(joint_vel) / robot.joint_velocity_limit
-    soles, others = height[:, points.is_sole].min(axis=1), height[:, ~points.is_sole].min(axis=1)
+    soles = height[:, points.is_sole].min(axis=1)
+    others = height[:, ~points.is_sole].min(axis=1, initial=np.inf)  # a robot may have shapes at its feet alone
     sliding = _sliding(points, positions, clip.fps)
     worst = {
         "limit_excess": _place(beyond, clip.fps, robot),

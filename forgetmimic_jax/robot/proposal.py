@@ -14,9 +14,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from forgetmimic_jax.robot.shapes import sphere_name
 from forgetmimic_jax.robot.standing import soles, standing
 from forgetmimic_jax.robot.tree import Tree
-from forgetmimic_jax.robot.vendor import Additions, Unreadable, read_mjcf
+from forgetmimic_jax.robot.vendor import Additions, Unreadable, read_mjcf, read_unmended
 
 KNEE, ELBOW = ("knee", "shin", "calf", "lower_leg"), ("elbow", "forearm", "lower_arm")
 HAND, FOOT = ("hand", "wrist", "palm", "gripper"), ("foot", "ankle", "sole")
@@ -24,6 +25,7 @@ ARMATURE_PER_TORQUE = 1.8e-4  # kg m^2 per N m: Unitree's G1 and H2 motors lie b
 STANDING = ("home", "stand", "standing", "default", "init", "knees_bent")  # a vendor's names of keyframes
 UPRIGHT = 0.99  # w of the root's quaternion
 ALIKE = 0.1  # of the robot's height
+BALL = 0.05  # m, radius of what stands for a body without a shape
 SPEED = 20.0  # rad/s, a motor's, which no MJCF says
 
 
@@ -44,9 +46,10 @@ def propose(file: Path) -> Proposal:
     """
     spec, notes = read_mjcf(file)
     try:
-        model, drawn = spec.copy().compile(), mujoco.MjSpec.from_file(str(file))
+        model = spec.copy().compile()
     except ValueError as error:
         raise Unreadable(" ".join(str(error).split())) from None
+    _, vendors, _ = read_unmended(file)
     missing: list[str] = []
     fixed = [model.joint(j).name for j in range(1, model.njnt) if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE]
     if fixed:
@@ -55,17 +58,12 @@ def propose(file: Path) -> Proposal:
         )
         spec, _ = read_mjcf(file, Additions(fixed=[re.escape(joint) for joint in fixed]))
         model = spec.copy().compile()
-    bare = set(range(1, model.nbody)) - {int(model.geom_bodyid[g]) for g in np.flatnonzero(model.geom_conaffinity)}
-    if bare:
-        notes.append(
-            f"{len(bare)} of {model.nbody - 1} bodies have no shape that touches: they pass through the ground"
-        )
     tree = Tree(model)
     limbs = tree.limbs()
     roles: dict[str, Any] = {"model": file.name}
     roles |= _bodies(tree, limbs, missing)
     roles |= {"natural_frequency_hz": 10.0, "damping_ratio": 2.0, "soft_limit_factor": 0.9}
-    roles |= _motors(model, torque_limits(drawn), missing)
+    roles |= _motors(model, torque_limits(vendors), missing)
     roles["ignored_motors"] = _ignored(tree, roles)
     endless = [model.joint(j).name for j in range(1, model.njnt) if not model.jnt_limited[j]]
     if endless:
@@ -74,12 +72,11 @@ def propose(file: Path) -> Proposal:
         )
     if fixed:
         roles["fixed"] = [re.escape(joint) for joint in fixed]
-    feet = roles.get("pairs", {}).get("feet")
-    if feet:
-        spheres = [sphere for foot in feet for sphere in soles(model, foot, notes)]
-        if spheres:
-            roles["spheres"] = spheres
-    roles |= standing(tree, roles, _keyframe(drawn, model))
+    spheres = _spheres(model, roles, notes)
+    if spheres:
+        roles["spheres"] = spheres
+    roles["head"] = _head(model, spheres)
+    roles |= standing(tree, roles, _keyframe(vendors, model))
     return Proposal(roles, notes, missing)
 
 
@@ -130,9 +127,8 @@ def _limb(tree: Tree, start: int, bends: Sequence[str], ends: Sequence[str]) -> 
     return above[len(above) // 2], bend, named[-1] if named else rest[-1]
 
 
-def torque_limits(spec: mujoco.MjSpec) -> dict[str, float]:
+def torque_limits(model: mujoco.MjModel) -> dict[str, float]:
     """N m of each joint that a vendor's file limits: at the joint, at its actuator, or by a motor's control range."""
-    model = spec.compile() if not any(mesh.file for mesh in spec.meshes) else _without_meshes(spec).compile()
     limits: dict[str, float] = {}
     for joint in range(model.njnt):
         name, found = model.joint(joint).name, []
@@ -151,20 +147,6 @@ def torque_limits(spec: mujoco.MjSpec) -> dict[str, float]:
         if found and name:
             limits[name] = float(min(found))
     return limits
-
-
-def _without_meshes(spec: mujoco.MjSpec) -> mujoco.MjSpec:
-    """A copy without meshes: forces do not depend on shapes. Bodies that weigh nothing then weigh 1 kg."""
-    spec = spec.copy()
-    for geom in list(spec.geoms):
-        if geom.meshname:
-            spec.delete(geom)
-    for mesh in list(spec.meshes):
-        spec.delete(mesh)
-    for body in spec.bodies[1:]:
-        if not body.explicitinertial:
-            body.explicitinertial, body.mass, body.inertia = True, 1.0, [0.1, 0.1, 0.1]
-    return spec
 
 
 def _motors(model: mujoco.MjModel, limits: Mapping[str, float], missing: list[str]) -> dict[str, Any]:
@@ -188,6 +170,32 @@ def _motors(model: mujoco.MjModel, limits: Mapping[str, float], missing: list[st
     return {"motors": motors, "joint_motors": rules}
 
 
+def _spheres(model: mujoco.MjModel, roles: Mapping[str, Any], notes: list[str]) -> list[list[Any]]:
+    """Shapes for key bodies and a head that have none: soles for the feet, a ball at the origin of the others."""
+    touching = {int(body) for body in model.geom_bodyid[model.geom_conaffinity > 0]}
+    bare = [model.body(body).name for body in range(1, model.nbody) if body not in touching]
+    feet = roles.get("pairs", {}).get("feet", ())
+    spheres = [sphere for foot in feet for sphere in soles(model, foot, notes)]
+    balls = [body for body in bare if body not in feet and (body in roles.get("key_bodies", ()) or _is_head(body))]
+    if balls:
+        notes.append(f"key bodies without a shape get a ball of {BALL} m: {', '.join(balls)}")
+    left = len(bare) - len(balls) - len(set(bare) & set(feet))
+    if left:
+        notes.append(f"{left} of {model.nbody - 1} bodies have no shape that touches: they pass through the ground")
+    return spheres + [[body, 0.0, 0.0, 0.0, BALL] for body in balls]
+
+
+def _is_head(name: str) -> bool:
+    return bool(re.search("head(?!ing)", name.lower()))
+
+
+def _head(model: mujoco.MjModel, spheres: Sequence[Sequence[Any]]) -> list[str]:
+    """The names of the head's shapes."""
+    geoms = [model.geom(int(geom)) for geom in np.flatnonzero(model.geom_conaffinity)]
+    own = [geom.name for geom in geoms if _is_head(geom.name) or _is_head(model.body(geom.bodyid[0]).name)]
+    return own + [sphere_name(body, number) for number, (body, *_) in enumerate(spheres) if _is_head(body)]
+
+
 def _ignored(tree: Tree, roles: Mapping[str, Any]) -> list[str]:
     """Joints beyond the elbows: a wrist that gives way moves nothing else."""
     found = []
@@ -198,15 +206,14 @@ def _ignored(tree: Tree, roles: Mapping[str, Any]) -> list[str]:
     return [re.escape(joint) for joint in found]
 
 
-def _keyframe(spec: mujoco.MjSpec, model: mujoco.MjModel) -> dict[str, float]:
+def _keyframe(vendors: mujoco.MjModel, model: mujoco.MjModel) -> dict[str, float]:
     """Joint angles of a vendor's keyframe of standing: called so, or the first that is upright; none without one."""
-    if not list(spec.keys):
+    if not vendors.njnt or vendors.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
         return {}
-    whole = _without_meshes(spec).compile()
-    upright = [key for key in range(whole.nkey) if whole.jnt_type[0] == 0 and abs(whole.key_qpos[key, 3]) > UPRIGHT]
+    upright = [key for key in range(vendors.nkey) if abs(vendors.key_qpos[key, 3]) > UPRIGHT]
     if not upright:
         return {}
-    key = next((key for key in upright if whole.key(key).name.lower() in STANDING), upright[0])
-    angles = {whole.joint(j).name: whole.key_qpos[key, whole.jnt_qposadr[j]] for j in range(whole.njnt)}
+    key = next((key for key in upright if vendors.key(key).name.lower() in STANDING), upright[0])
+    angles = {vendors.joint(j).name: vendors.key_qpos[key, vendors.jnt_qposadr[j]] for j in range(vendors.njnt)}
     joints = [model.joint(j).name for j in range(1, model.njnt)]
     return {joint: round(float(angles[joint]), 4) for joint in joints if abs(angles.get(joint, 0.0)) > 1e-6}

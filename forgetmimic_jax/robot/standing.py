@@ -101,6 +101,8 @@ def _soles(model: mujoco.MjModel, data: mujoco.MjData, roles: Mapping[str, Any])
             along.append(float(data.geom_xpos[geom, 0]))
     for body, *place, radius in roles.get("spheres", ()):
         at = model.body(body).id
+        if at not in feet:
+            continue
         point = data.xpos[at] + data.xmat[at].reshape(3, 3) @ np.array(place)
         lowest.append(float(point[2]) - radius)
         along.append(float(point[0]))

@@ -358,6 +358,6 @@ def load_config(path: Path) -> Config:
         content = yaml.safe_load(path.read_text())
     except FileNotFoundError:
         raise InputError(f"{path}: no such config") from None
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError) as error:
         raise InputError(f"{path}: not YAML: {str(error).splitlines()[0]}") from None
     return from_dict(Config, content, str(path))

@@ -69,7 +69,8 @@ def run_tasks(tasks: Sequence[Task], *, jobs: int, cluster: str | None = None, d
             finally:
                 for future in running:
                     future.cancel()
-                place.stop([_absolute(futures[future]).folder for future in running])
+                if running:
+                    place.stop([_absolute(futures[future]).folder for future in running])
     return failed
 
 
@@ -109,7 +110,11 @@ def _run_on_worker(task: Task, directory: Path, code: str) -> str | None:
 
     worker = get_worker()
     key = worker.get_current_task()
-    wanted = lambda: worker.state.tasks[key].state != "cancelled"  # noqa: E731
+
+    def wanted() -> bool:
+        known = worker.state.tasks.get(key)
+        return known is not None and known.state != "cancelled"
+
     return run_task(task, directory, code, worker.state.nthreads, wanted)
 
 

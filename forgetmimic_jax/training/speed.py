@@ -133,7 +133,7 @@ def _environment_alone(env: tracking.Environment) -> Callable:
 
 def _raw_stepping(model, num_envs: int, substeps: int, physics, targets) -> Callable[[], float]:
     """Seconds that plain `mujoco.batch` needs for the same states and targets; loading them is not counted."""
-    batch = mujoco.batch.Batch(model, num_envs)
+    batch = mujoco.batch.Batch(model, num_envs, cores())
     rows = [np.asarray(x, np.float64) for x in (physics.qpos, physics.qvel, physics.warmstart, targets)]
 
     def run() -> float:

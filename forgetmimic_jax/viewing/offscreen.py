@@ -13,6 +13,7 @@ from types import TracebackType
 import mujoco
 import numpy as np
 
+from forgetmimic_jax.basics.drawing import chosen_library
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.robot.model import VISUAL_GROUP, read_spec, relative_height
 
@@ -168,7 +169,7 @@ def _backend():
     """
     if platform.system() == "Darwin":
         return importlib.import_module("mujoco.cgl")
-    wanted = os.environ.get("MUJOCO_GL", "").lower()
+    wanted = chosen_library()
     names = [wanted] if wanted in ("egl", "osmesa") else ["egl", "osmesa"]
     for name in names:
         trial = f"from mujoco.{name} import GLContext; GLContext(16, 16).make_current()"

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import queue
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 
@@ -15,9 +14,8 @@ import viser
 from scipy.spatial.transform import Rotation
 
 from forgetmimic_jax.robot.model import Robot, relative_height
-from forgetmimic_jax.viewing.offscreen import drawing_model
 from forgetmimic_jax.viewing.playback import Playback
-from forgetmimic_jax.viewing.shapes import UNIT_MESHES, Shapes, shapes
+from forgetmimic_jax.viewing.shapes import UNIT_MESHES, Shapes
 from forgetmimic_jax.viewing.takes import in_words
 
 PICTURES_PER_SECOND, PLOTS_PER_SECOND = 25.0, 5.0
@@ -32,45 +30,50 @@ REFERENCE_CURVE = "#2ca02c"
 
 
 class Page:
-    """Serves the page on this machine and moves what it shows. Simulation and drawing happen on the caller's thread."""
+    """What one browser shows, and what its visitor does. Simulation and drawing happen on the caller's thread."""
 
     def __init__(
         self,
+        client: viser.ClientHandle | viser.ViserServer,
         playback: Playback,
         robot: Robot,
+        drawn: Mapping[str, Shapes],
         policies: Sequence[str],
         clips: Sequence[str],
         targets: Sequence[str],
-        *,
-        port: int,
     ):
-        self._playback, self._policies = playback, list(policies)
+        """Fill the page.
+
+        Args:
+            client: the browser; a server stands for all of its browsers.
+            playback: what the page shows.
+            robot: of the playback.
+            drawn: the robot's shapes to be seen.
+            policies: names of the playback's policies.
+            clips: names of the library's clips.
+            targets: clips to forget.
+        """
+        self._client, self._playback, self._policies = client, playback, list(policies)
         self._model, self._data = robot.model, mujoco.MjData(robot.model)
-        self._todo: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()  # what the page's visitors want done
+        self._todo: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()  # what the page's visitor wants done
         self._random = np.random.default_rng()
         self._playing, self._due = True, time.monotonic()
-        with contextlib.redirect_stdout(io.StringIO()):  # viser's own announcement
-            self._server = viser.ViserServer(host="127.0.0.1", port=port, label="ForgetMimic", verbose=False)
-        self.address = f"http://127.0.0.1:{self._server.get_port()}"
         self._targets = {clips.index(target) for target in targets}
         self._menu = {f"{clip} (to be forgotten)" if clip in targets else clip: i for i, clip in enumerate(clips)}
-        self._build_scene(shapes(drawing_model(robot.name, 16, 16)))
+        self._build_scene(drawn)
         self._build_controls()
         self._show(plots=True)
 
-    def close(self) -> None:
-        """Stop serving."""
-        with contextlib.redirect_stdout(io.StringIO()):
-            self._server.stop()
-
-    def run(self, until: Callable[[], bool] = lambda: False) -> None:
-        """Play in real time until `until()`."""
+    def run(self, gone: threading.Event, turn: threading.Lock) -> None:
+        """Play in real time until the browser is gone; it simulates while it has `turn`."""
         shown = plotted = 0.0
-        while not until():
-            changed = self._obey()
+        while not gone.is_set():
+            with turn:
+                changed = self._obey()
             now = time.monotonic()
             if self._playing and now >= self._due:
-                self._advance()
+                with turn:
+                    self._advance()
                 self._due += self._playback.control_step / self._speed.value
                 self._due = max(self._due, now - 0.1)  # too slow a machine plays slowly, and does not catch up in leaps
                 changed = True
@@ -87,7 +90,7 @@ class Page:
             self._playback.begin(self._playback.clip)
 
     def _obey(self) -> bool:
-        """Do what visitors wanted since the last time; whether there was anything."""
+        """Do what the visitor wanted since the last time; whether there was anything."""
         busy = not self._todo.empty()
         while not self._todo.empty():
             self._todo.get()()
@@ -96,26 +99,23 @@ class Page:
     # The scene
 
     def _build_scene(self, robot: Mapping[str, Shapes]) -> None:
-        scene = self._server.scene
-        scene.set_background_image(np.full((1, 1, 3), 244, np.uint8))
+        scene = self._client.scene
         size = relative_height(self._model)
         middle, apart, height = (len(self._policies) - 1) / 2.0, LANE[1] + LANE_GAP, LABEL_HEIGHT * size
         self._lanes = [_Lane(scene, name, robot, (i - middle) * apart, height) for i, name in enumerate(self._policies)]
-        camera = self._server.initial_camera
-        camera.position, camera.look_at = size * np.array([3.4, -0.9, 1.5]), size * np.array([0.0, 0.0, 0.62])
 
     def _show(self, plots: bool) -> None:
         playback = self._playback
         heading = _yaw(playback.start)
         reference = self._poses(playback.reference)
-        with self._server.atomic():
+        with self._client.atomic():
             for policy, (lane, qpos) in enumerate(zip(self._lanes, playback.qpos, strict=True)):
                 shown = reference if self._ghost.value else None
                 lane.show(qpos, self._poses(qpos), shown, playback.reference, heading)
                 lane.tell(*self._in_words(policy), fell=playback.fell[policy] is not None)
             if plots:
                 self._show_plots()
-        self._server.flush()
+        self._client.flush()
 
     def _in_words(self, policy: int) -> tuple[str, str]:
         playback = self._playback
@@ -141,9 +141,7 @@ class Page:
     # The controls and plots
 
     def _build_controls(self) -> None:
-        gui, playback = self._server.gui, self._playback
-        gui.configure_theme(show_logo=False, show_share_button=False)
-        gui.main_panel.dock_right()
+        gui, playback = self._client.gui, self._playback
         names = list(self._menu)
         menu = gui.add_dropdown("Clip", names, initial_value=names[playback.clip])
         keys = gui.add_button_group("Time", ("Play", "Pause", "Step", "Restart"), hint="a step is one control step")

@@ -43,7 +43,7 @@ class Playback:
         for policy, terminated in enumerate(np.asarray(result.terminated)):
             if terminated and self.ended[policy] is None and self.step < self.horizon:
                 self.ended[policy] = max(self.step, 1)
-        for policy, falls in enumerate(np.asarray(happened.falls)):
+        for policy, falls in enumerate(np.asarray(happened.fallen)):
             if falls and self.fell[policy] is None:
                 self.fell[policy] = self.step + 1
         self.impact = np.maximum(self.impact, happened.impact)

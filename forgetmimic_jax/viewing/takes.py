@@ -123,7 +123,7 @@ def record(
         impacts.append(np.asarray(happened.impact))
         now = np.asarray(result.terminated) & (ended < 0) & (step < horizon)
         ended[now] = max(step, 1)  # as the evaluation counts: the step that breaks a bound does not count
-        fell[np.asarray(happened.falls) & (fell < 0) & (step < horizon + hold)] = step + 1
+        fell[np.asarray(happened.fallen) & (fell < 0) & (step < horizon + hold)] = step + 1
     qpos, tracking_reward, impact = (np.stack(series, axis=1) for series in (poses, rewards, impacts))
 
     def take(row: int) -> Take:

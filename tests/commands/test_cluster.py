@@ -5,19 +5,18 @@ import os
 import re
 import signal
 import threading
-import time
 
 import jax
 import numpy as np
 import pytest
 from distributed import Client, LocalCluster
 from miniature import Run, finished, load_state
+from waiting import until
 
 from forgetmimic_jax import unlearn
 from forgetmimic_jax.basics.provenance import cores
 from forgetmimic_jax.settings.options import parse
 from forgetmimic_jax.studies.executor import RESOURCE
-from forgetmimic_jax.studies.task import Task
 from forgetmimic_jax.studies.trials import Trial, make_trial, run_trials
 
 LENGTH = 30  # iterations, with a checkpoint every two: long enough to be killed on the way
@@ -32,32 +31,30 @@ def cluster():
         yield cluster
 
 
-def worker_of(task: Task) -> int:
-    """The process of the worker that runs a task."""
-    return int(task.mark.read_text().split()[1])
+def worker_of(trial: Trial) -> int:
+    """The process of the worker that runs a trial."""
+    return int(trial.task.mark.read_text().split()[1])
 
 
-def kill_worker(trial: Trial, killed: list[int]) -> None:
-    """Kill the worker of a trial once the trial has trained a little."""
-    while not (trial.folder / "checkpoints" / "00000002" / "meta.json").is_file():
-        time.sleep(0.01)
-    killed.append(worker_of(trial.task))
-    os.kill(killed[0], signal.SIGKILL)
-    while trial.task.mark.is_file() and worker_of(trial.task) == killed[0]:
-        time.sleep(0.01)
-    killed.append(worker_of(trial.task))
+def kill_worker(trial: Trial, workers: list[int]) -> None:
+    """Kill the worker of a trial that has trained a little; notes it, and the one that runs the trial then."""
+    until((trial.folder / "checkpoints" / "00000002" / "meta.json").is_file)
+    workers.append(worker_of(trial))
+    os.kill(workers[0], signal.SIGKILL)
+    until(lambda: worker_of(trial) != workers[0])
+    workers.append(worker_of(trial))
 
 
 def test_a_trial_whose_worker_is_killed_ends_on_the_other_as_it_would_have(cluster, base_run, tmp_path, capsys):
     options = {"base": base_run.checkpoint(4), "targets": "turn", "iterations": LENGTH, "episodes": 2}
     trial = make_trial(tmp_path / "trials", options)
     processes = set(Client(cluster, set_as_default=False).run(os.getpid).values())
-    killed: list[int] = []
-    killer = threading.Thread(target=kill_worker, args=(trial, killed), daemon=True)
+    workers: list[int] = []
+    killer = threading.Thread(target=kill_worker, args=(trial, workers), daemon=True)
     killer.start()
     assert run_trials([trial], jobs=1, cluster=cluster.scheduler_address, description="try") == {}
     killer.join()
-    assert set(killed) == processes
+    assert set(workers) == processes
     printed = trial.task.log.read_text()
     first, second = map(int, re.findall(rf"^forget turn by arft: (\d+)/{LENGTH}$", printed, re.MULTILINE))
     assert first == 0

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from forgetmimic_jax import play
-from forgetmimic_jax.viewing import page
+from forgetmimic_jax.viewing import server
 
 
 @pytest.fixture
@@ -17,13 +17,13 @@ def options(base_run):
 def test_base_and_unlearned_policy_are_served_from_the_first_target_on(unlearned_run, monkeypatch, capsys):
     seen = []
 
-    def run(self) -> None:
-        seen.append((self._policies, list(self._menu), self._playback.clip, self._playback.step))
+    def wait(self) -> None:
+        seen.append((self._stage.names, self._stage.library.names, self._targets, self._first))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(page.Page, "run", run)
+    monkeypatch.setattr(server.Server, "wait", wait)
     play.main(play.Options(checkpoint=unlearned_run.checkpoint(2), port=18180))
-    assert seen == [(["base", "unlearned"], ["sway", "turn (to be forgotten)", "nod"], 1, 0)]
+    assert seen == [(("base", "unlearned"), ("sway", "turn", "nod"), ("turn",), 1)]
     assert "Open http://127.0.0.1:18180 in a browser; Ctrl-C ends it." in capsys.readouterr().out
 
 
@@ -33,6 +33,11 @@ def test_base_and_unlearned_policy_are_served_from_the_first_target_on(unlearned
         ({"robot": "gg1", "checkpoint": None}, "robot 'gg1': no robots/gg1/gg1.yaml; did you mean 'g1'?"),
         ({"checkpoint": Path("nowhere")}, "nowhere: no such checkpoint folder"),
         ({"port": 80}, "--port: found 80; accepted: 1024 to 65535"),
+        (
+            {"host": "192.0.2.1"},
+            "--host: found 192.0.2.1; accepted: an address of this machine, such as 127.0.0.1, or 0.0.0.0 for all of "
+            "them ([Errno 99] Cannot assign requested address)",
+        ),
         ({"seed": -1}, "--seed: found -1; accepted: 0 or more"),
         ({"library": Path("nowhere")}, "nowhere/manifest.json: not found; a library is a folder with manifest.json"),
     ],

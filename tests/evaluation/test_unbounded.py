@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from forgetmimic_jax.evaluation import tables
 from forgetmimic_jax.evaluation.document import EvaluationDocument, read_evaluation, write_evaluation
-from forgetmimic_jax.evaluation.side_by_side import Happened, falls, happened
+from forgetmimic_jax.evaluation.side_by_side import Happened, fallen_unlike_clip, happened
 from forgetmimic_jax.evaluation.statistics import bootstrap_quantile, resampling_weights
 from forgetmimic_jax.evaluation.summary import evaluate_policies
 from forgetmimic_jax.evaluation.unbounded import UnboundedRollout, add_numbers, episode_numbers, roll_out
@@ -35,7 +35,7 @@ def made_up(steps: list[int], horizon: list[int], clip: list[int] | None = None,
         for episode, at in events.items():
             for step, value in at.items():
                 values[name][episode, step] = value
-    values["falls"] = values["falls"] > 0
+    values["fallen"] = values["fallen"] > 0
     return UnboundedRollout(
         clip=np.zeros(episodes, int) if clip is None else np.array(clip),
         start_frame=np.zeros(episodes, int),
@@ -48,7 +48,7 @@ def made_up(steps: list[int], horizon: list[int], clip: list[int] | None = None,
 
 
 def test_a_robot_is_upright_if_it_never_falls_before_its_episode_ends():
-    rollout = made_up([10, 10, 8, 10], [5] * 4, falls={1: {0: 1}, 2: {8: 1}, 3: {4: 1, 5: 1, 9: 1}})
+    rollout = made_up([10, 10, 8, 10], [5] * 4, fallen={1: {0: 1}, 2: {8: 1}, 3: {4: 1, 5: 1, 9: 1}})
     numbers = episode_numbers(rollout)
     np.testing.assert_array_equal(numbers["upright_rate"], [1, 0, 1, 0])
     np.testing.assert_allclose(numbers["time_to_fall"], [1.0, 0.1, 0.8, 0.5])  # the end where there is none
@@ -68,7 +68,7 @@ def test_an_impact_is_the_largest_of_the_episode_and_its_speed_that_before_the_f
         [3, 3, 3],
         impact={0: {2: 0.4, 4: 3.5, 5: 1.0, 6: 99.0}, 1: {5: 1.0}},
         impact_speed={0: {2: 0.8, 4: 2.5, 6: 9.0}, 1: {5: 1.5}},
-        falls={0: {3: 1}},
+        fallen={0: {3: 1}},
     )
     numbers = episode_numbers(rollout)
     np.testing.assert_array_equal(numbers["impact_force"], [3.5, 1.0, 0.0])
@@ -194,7 +194,7 @@ def test_a_tilt_that_the_clip_has_too_is_no_fall_but_a_low_root_is(robot, frames
 
     def fell(bodies: Bodies, clip: Bodies) -> bool:
         reference = dataclasses.replace(frames, bodies=clip)
-        return bool(falls(robot, step_result(robot, reference, bodies).pair)[0])
+        return bool(fallen_unlike_clip(robot, step_result(robot, reference, bodies).pair)[0])
 
     assert [fell(upright, upright), fell(tilted, upright), fell(tilted, tilted)] == [False, True, False]
     assert float(low.pos[0, robot.root, 2]) < 0.38
@@ -212,9 +212,9 @@ def test_the_zero_action_falls_and_stays_down_to_the_end(rolled, robot):
     np.testing.assert_array_equal(rollout.start_frame[:2], 0)
     np.testing.assert_array_equal(rollout.horizon, 40 - rollout.start_frame)
     np.testing.assert_array_equal(rollout.steps, rollout.horizon + 150)  # 3 s
-    assert rollout.happened.falls.shape == (4, 190)
+    assert rollout.happened.fallen.shape == (4, 190)
     last = rollout.steps - 1
-    assert rollout.happened.falls[np.arange(4), last].all()
+    assert rollout.happened.fallen[np.arange(4), last].all()
     numbers = episode_numbers(rollout)
     assert not numbers["upright_rate"].any()
     assert (numbers["impact_force"] > 1.0).all()
@@ -246,8 +246,8 @@ def document(make_rollout):
     policies = evaluate_policies({"base": rollout, "unlearned": rollout}, names, ["punch", "kick"], seed=0)
     clips = [1] * 4 + [2] * 4
     impact = {episode: {2: 0.5 * episode} for episode in range(8)}
-    base = made_up([5] * 8, [5] * 8, clips, falls={6: {4: 1}, 7: {4: 1}}, impact=impact)
-    unlearned = made_up([5] * 8, [5] * 8, clips, falls={episode: {0: 1} for episode in range(8)}, impact=impact)
+    base = made_up([5] * 8, [5] * 8, clips, fallen={6: {4: 1}, 7: {4: 1}}, impact=impact)
+    unlearned = made_up([5] * 8, [5] * 8, clips, fallen={episode: {0: 1} for episode in range(8)}, impact=impact)
     starts = np.array([0, 0, 3, 4] * 2)
     rolled = {
         name: dataclasses.replace(of, start_frame=starts) for name, of in (("base", base), ("unlearned", unlearned))

@@ -4,11 +4,13 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.motion import library, plausible
 from forgetmimic_jax.motion.converting import breadth_first, converted
+from forgetmimic_jax.motion.kinematics import resample
 from forgetmimic_jax.motion.plausible import check_plausible, doubt_of
 from forgetmimic_jax.motion.readers import read_motion
 from forgetmimic_jax.motion.recording import Reading, Recording
@@ -67,6 +69,21 @@ def test_real_clips_leave_no_doubt_and_wrong_readings_are_refused(clips, tmp_pat
                 assert str(caught.value).endswith(f": {flags}"), clip.name
 
 
+def test_a_rough_retarget_is_no_other_robot_s_motion(clips, tmp_path):
+    """At 30 Hz, joints noisy by 0.02 rad, the root by 1 cm, its path a third too long: notes at most."""
+    robot, real = clips
+    rng = np.random.default_rng(0)
+    for clip in real:
+        slow = resample(clip, 30.0)
+        rough = dataclasses.replace(
+            slow,
+            joint_pos=slow.joint_pos + rng.normal(0.0, 0.02, slow.joint_pos.shape),
+            root_pos=slow.root_pos * [1.3, 1.3, 1.0]
+            + gaussian_filter1d(rng.normal(0.0, 0.05, (slow.num_frames, 3)), 4.0, axis=0),
+        )
+        assert check_plausible(robot, recorded(rough), Reading(), rough, tmp_path / "clip.csv") == [], clip.name
+
+
 def test_swapped_sides_are_noticed(clips, tmp_path):
     """In every clip but the walk whose feet skate as much as when it is swapped (yanjie)."""
     robot, real = clips
@@ -93,7 +110,8 @@ def test_a_doubt_by_hand(robot):
     low = doubt_of(robot, still)
     high = doubt_of(robot, dataclasses.replace(still, root_pos=path + np.array([0.0, 0.0, 1.0])))
     assert low.limit == pytest.approx(0.3)
-    assert low.slide == pytest.approx(0.6)
+    assert (low.slide, low.travel) == pytest.approx((0.6, 0.6))
     assert low.wander == pytest.approx(0.0, abs=1e-9)
     assert high.level == pytest.approx(low.level + 1.0)
     assert low.size == pytest.approx(0.3 / 0.15 + abs(low.level) / 0.3 + 0.6 / 0.3)
+    assert low.size_at_scale == pytest.approx(low.size - 0.3 * 0.6 / 0.3)

@@ -213,7 +213,7 @@ def test_the_g1_s_own_roles_are_proposed():
 
 def test_a_foot_without_a_shape_gets_a_sole_from_its_inertia(written):
     """A box of 0.6 kg with these moments is 23.65 x 9.0 x 4.0 cm: edges from m (b^2 + c^2) / 12."""
-    spheres = propose(written()).roles["spheres"]
+    spheres = [sphere for sphere in propose(written()).roles["spheres"] if "foot" in sphere[0]]
     assert [sphere[0] for sphere in spheres] == ["left_foot"] * 4 + ["right_foot"] * 4
     places = np.array([sphere[1:4] for sphere in spheres[:4]])
     moments = np.array([0.0005, 0.0029, 0.0032])
@@ -221,6 +221,26 @@ def test_a_foot_without_a_shape_gets_a_sole_from_its_inertia(written):
     assert edges == pytest.approx([0.2366, 0.0894, 0.0447], abs=1e-3)
     np.testing.assert_allclose(np.ptp(places, axis=0)[:2], edges[:2] - 0.02, atol=2e-4)
     np.testing.assert_allclose(places[:, 2], -0.03 - edges[2] / 2 + 0.01, atol=1e-4)
+
+
+def test_key_bodies_without_a_shape_get_a_ball(written, made):
+    robot, proposal = made(written())
+    balls = [sphere for sphere in proposal.roles["spheres"] if "foot" not in sphere[0]]
+    expected = ["left_upper", "left_shin", "right_upper", "right_shin", "left_forearm", "right_forearm"]
+    assert sorted(balls) == sorted([body, 0.0, 0.0, 0.0, 0.05] for body in expected)
+    touching = {robot.model.body(body).name for body in robot.model.geom_bodyid[robot.model.geom_conaffinity > 0]}
+    assert touching >= set(robot.key_bodies)
+
+
+def test_the_head_is_found_with_a_shape_or_without(written, made):
+    chest = '<geom type="capsule" size="0.1 0.15" pos="0 0 0.2"/>'
+    inertial = '<inertial pos="0 0 0.1" mass="1" diaginertia="0.01 0.01 0.01"/>'
+    for shape, name in (("", "head_link_sphere"), ('<geom size="0.1"/>', "head_link_shape0")):
+        head = f'{chest}<body name="head_link" pos="0 0 0.5">{inertial}{shape}</body>'
+        robot, proposal = made(written((chest, head)))
+        (found,) = proposal.roles["head"]
+        assert found.startswith(name)
+        assert [robot.model.geom(geom).name for geom in robot.head_geom_ids] == [found]
 
 
 def test_knees_bend_the_right_way_and_the_robot_stands(written, made):
@@ -347,6 +367,15 @@ def test_meshes_that_are_not_there_are_left_out(written):
     spec, notes = read_mjcf(written(mesh, geom))
     spec.compile()
     assert any("mesh files are not in" in note and "shell" in note for note in notes)
+
+
+def test_textures_that_are_not_there_are_left_out(written):
+    assets = '<asset><texture name="t" type="2d" file="t.png"/><material name="m" texture="t" rgba="1 0 0 1"/></asset>'
+    geom = ('<geom type="box" size="0.1 0.1 0.05"/>', '<geom type="box" size="0.1 0.1 0.05" material="m"/>')
+    spec, notes = read_mjcf(written(("<worldbody>", f"{assets}<worldbody>"), geom))
+    model = spec.compile()
+    np.testing.assert_array_equal(model.geom("base_shape0").rgba, [1, 0, 0, 1])
+    assert "texture files are not there: materials are left out" in notes
 
 
 def test_a_mesh_becomes_the_capsule_that_fits_it(written, tmp_path):

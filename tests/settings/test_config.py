@@ -154,8 +154,9 @@ def test_a_missing_file_is_told(path):
         load_config(path)
 
 
-def test_a_file_that_is_no_yaml_is_told_in_one_line(path):
-    path.write_text("ppo: [1\n")
+@pytest.mark.parametrize("content", [b"ppo: [1\n", b"ppo: \xff\n"])
+def test_a_file_that_is_no_yaml_is_told_in_one_line(path, content):
+    path.write_bytes(content)
     with pytest.raises(InputError, match=r"config\.yaml: not YAML") as caught:
         load_config(path)
     assert "\n" not in str(caught.value)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from distributed import LocalCluster
+from waiting import until
 
 from forgetmimic_jax.basics.errors import InputError, Interrupted
 from forgetmimic_jax.basics.provenance import cores, provenance
@@ -122,10 +123,8 @@ def test_a_stop_lets_the_running_task_save_and_the_next_time_it_is_resumed(tmp_p
     wanted = a_task(tmp_path, 9)
 
     def stop_at(line: str) -> None:
-        while not (tmp_path / "trials" / "journal").is_file() or line not in journal(tmp_path):
-            time.sleep(0.02)
-        while not (wanted.folder / "metrics.jsonl").is_file():
-            time.sleep(0.02)
+        until(lambda: (tmp_path / "trials" / "journal").is_file() and line in journal(tmp_path))
+        until((wanted.folder / "metrics.jsonl").is_file)
         os.kill(os.getpid(), signal.SIGTERM)
 
     for expected in (["start 9", "stopped 9"], ["start 9+", "stopped 9+"]):
@@ -223,8 +222,7 @@ def test_a_stop_lets_the_tasks_of_a_cluster_save(tmp_path, worker):
     wanted = a_task(tmp_path, 9)
 
     def stop() -> None:
-        while not (wanted.folder / "metrics.jsonl").is_file():
-            time.sleep(0.02)
+        until((wanted.folder / "metrics.jsonl").is_file)
         os.kill(os.getpid(), signal.SIGTERM)
 
     thread = threading.Thread(target=stop)
@@ -241,10 +239,8 @@ def test_a_task_whose_program_is_gone_saves_and_ends(tmp_path, worker, monkeypat
     wanted.folder.parent.mkdir()
     with on_cluster(worker.scheduler_address) as place:
         place.executor.submit(place.run, wanted, tmp_path, provenance().code)
-        while not (wanted.folder / "metrics.jsonl").is_file():
-            time.sleep(0.02)
-    while wanted.mark.exists():
-        time.sleep(0.02)
+        until((wanted.folder / "metrics.jsonl").is_file)
+    until(lambda: not wanted.mark.exists())
     assert journal(tmp_path) == ["start 9", "stopped 9"]
 
 

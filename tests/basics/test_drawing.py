@@ -1,0 +1,45 @@
+"""A library to draw with that is missing breaks no command that draws nothing."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from forgetmimic_jax.basics.drawing import CHOICE, chosen_library, draw_later
+
+MISSING = ("egl", "glfw", "osmesa", "nonsense")
+# As in a container without such a library, whatever this machine has.
+IMPORTS = """
+import sys
+for name in ("glfw", "OpenGL"):
+    class Missing:
+        def __getattr__(self, attribute):
+            raise OSError(f"lib{name} is missing")
+    sys.modules[name] = Missing()
+from forgetmimic_jax.basics.errors import run_command
+def work():
+    import forgetmimic_jax.training.run, forgetmimic_jax.evaluation.evaluate, forgetmimic_jax.viewing.offscreen
+    print("ready")
+run_command(work)
+"""
+
+
+@pytest.mark.parametrize("library", MISSING)
+def test_a_library_that_is_missing_breaks_no_command(library):
+    environment = os.environ | {"MUJOCO_GL": library}
+    environment.pop(CHOICE, None)
+    program = [sys.executable, "-m", "forgetmimic_jax", "train", "--help"]
+    listed = subprocess.run(program, env=environment, capture_output=True, text=True)
+    assert (listed.returncode, listed.stderr) == (0, "")
+    done = subprocess.run([sys.executable, "-c", IMPORTS], env=environment, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "ready\n", "")
+
+
+def test_what_draws_still_knows_the_users_choice(monkeypatch):
+    monkeypatch.delenv(CHOICE, raising=False)
+    monkeypatch.setenv("MUJOCO_GL", "EGL")
+    assert chosen_library() == "egl"
+    for _ in range(2):  # a second command of the process, or a process of the command
+        draw_later()
+        assert (os.environ["MUJOCO_GL"], chosen_library()) == ("disable", "egl")

@@ -1,0 +1,285 @@
+"""Faults on purpose, in numbers: `make soak`. It is no part of `make test`.
+
+kill: kill -9 at random moments of train, unlearn, evaluate and `motions import`. No folder is half written, what was
+saved continues, and the result is that of a run that nobody killed.
+full: the same with a disk that becomes full, at a random size. It needs Linux with user namespaces.
+inputs: mutated clips, YAML, MJCF, checkpoints, ONNX, pickles and flags (mutations.py). No traceback, no code run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from commands.miniature import TINY
+from conftest import SWAY_FRAMES, TURN_FRAMES, invented_clip
+from mutations import FAMILIES
+
+from forgetmimic_jax.basics.files import read_rows
+from forgetmimic_jax.motion.clip import write_clip
+from forgetmimic_jax.motion.library import file_hash, write_manifest
+from forgetmimic_jax.robot.model import load_robot
+from forgetmimic_jax.training.checkpoint import META, POLICY, newest_checkpoint
+
+ROOT = Path(__file__).resolve().parents[1]
+LENGTH = 40  # iterations, with a checkpoint after each second one
+AT_START = 0.2  # share of the kills that come at any moment; the others come after the first file was written
+TMPFS = 2**28  # bytes, more than any run here writes
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A command that writes a folder, and what decides whether the folder is right.
+
+    Args:
+        arguments: of the command, without its folder.
+        output: the flag of the folder.
+        resumes: it continues with --resume; otherwise it is given again as it is.
+        result: of a folder that is finished, equal in equal runs.
+    """
+
+    arguments: tuple[str, ...]
+    output: str
+    resumes: bool
+    result: Callable[[Path], Any]
+
+    def start(self, folder: Path) -> subprocess.Popen:
+        """The command, as it starts or continues in the folder."""
+        resume = self.resumes and newest_checkpoint(folder) is not None
+        if self.resumes and not resume:
+            shutil.rmtree(folder, ignore_errors=True)  # nothing in it to continue with
+        command = [sys.executable, "-m", "forgetmimic_jax", *self.arguments, self.output, str(folder)]
+        environment = os.environ | {"PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
+        return subprocess.Popen(
+            command + ["--resume"] * resume,
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+
+
+def trained(folder: Path) -> Any:
+    """The policy's bytes, and what was logged and measured."""
+    newest = newest_checkpoint(folder)
+    assert newest is not None
+    rows = [{**row, "seconds": 0.0} for row in read_rows(folder / "metrics.jsonl")]
+    return file_hash(newest / POLICY), rows, evaluated(folder) if (folder / "evaluation.json").exists() else None
+
+
+def evaluated(folder: Path) -> Any:
+    """The measured numbers."""
+    return json.loads((folder / "evaluation.json").read_text())["policies"]
+
+
+def imported(folder: Path) -> Any:
+    """The clips' bytes."""
+    return {path.name: file_hash(path) for path in folder.glob("*.npz")}
+
+
+def half_written(folder: Path) -> list[str]:
+    """What is wrong with the files of a folder."""
+    faults = []
+    for path in sorted(folder.rglob("*.json")):
+        hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
+        if hidden or "run" in path.relative_to(folder).parts:
+            continue  # what is being written is hidden, and orbax's files are checked with the others of a checkpoint
+        try:
+            content = json.loads(path.read_text())
+        except ValueError as error:
+            faults.append(f"{path}: {error}")
+            continue
+        listed = content.get("files", {}) if path.name == META else {}
+        if path.name == "manifest.json":
+            listed = {f"{name}.npz": clip["sha256"] for name, clip in content["clips"].items()}
+        for name, digest in listed.items():
+            file = path.parent / name
+            found = hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else "missing"
+            if not found.startswith(digest):
+                faults.append(f"{file}: {found}, not {digest}")
+    return faults
+
+
+def scenes(folder: Path) -> dict[str, Scene]:
+    """The commands on two invented clips and a small base, which are made here."""
+    robot, library = load_robot("g1"), folder / "library"
+    library.mkdir()
+    entries = {}
+    for name, frames, yaw_rate in (("sway", SWAY_FRAMES, 0.0), ("turn", TURN_FRAMES, 1.0)):
+        clip = invented_clip(robot, name, frames, yaw_rate, 0.2)
+        write_clip(clip, library / f"{name}.npz")
+        entries[name] = {"sha256": file_hash(library / f"{name}.npz")}
+    rows = np.concatenate([clip.root_pos, np.roll(clip.root_quat, -1, axis=-1), clip.joint_pos], axis=-1)
+    np.savetxt(folder / "turn.csv", rows, delimiter=",", fmt="%.6f")
+    write_manifest(library, {"schema": 1, "robot": "g1", "fps": 50.0, "default_targets": ["turn"], "clips": entries})
+    length = ("--iterations", str(LENGTH))
+    train = ("train", "--library", str(library), *length, "--set", *TINY)
+    base = folder / "base"
+    said, code = finish(Scene(train, "--output", True, trained).start(base))
+    assert code == 0, said
+    checkpoint = str(newest_checkpoint(base))
+    forget = ("unlearn", "--base", checkpoint, "--targets", "turn", "--episodes", "2", *length)
+    measure = ("evaluate", "--checkpoint", checkpoint, "--episodes", "2")
+    convert = ("motions", "import", str(folder / "turn.csv"), "--fps", "50", "--force")
+    return {
+        "train": Scene(train, "--output", True, trained),
+        "unlearn": Scene(forget, "--output", True, trained),
+        "evaluate": Scene(measure, "--output", False, evaluated),
+        "import": Scene(convert, "--library", False, imported),
+    }
+
+
+def finish(process: subprocess.Popen) -> tuple[str, int]:
+    """What a process says until its end, and its exit code."""
+    said, _ = process.communicate()
+    return said, process.returncode
+
+
+def undisturbed(scene: Scene, folder: Path) -> tuple[Any, float, float]:
+    """The result that nothing disturbed, s until the first file, and s from there to the end."""
+    begin, process = time.monotonic(), scene.start(folder)
+    while not folder.is_dir() and process.poll() is None:
+        time.sleep(0.01)
+    first = time.monotonic() - begin
+    said, code = finish(process)
+    assert code == 0, said
+    return scene.result(folder), first, time.monotonic() - begin - first
+
+
+def wait_for_a_file(process: subprocess.Popen, folder: Path) -> None:
+    """Wait until a process writes into a folder, or ends."""
+
+    def seen() -> dict[str, int]:
+        return {path.name: path.stat().st_mtime_ns for path in (folder, *folder.glob("*")) if path.exists()}
+
+    before = seen()
+    while process.poll() is None and seen() == before:
+        time.sleep(0.005)
+
+
+def kill(scene: Scene, folder: Path, times: int, rng: random.Random) -> list[str]:
+    """Kill a command so many times, each time as it continues or starts over; returns the faults."""
+    wanted, before, span = undisturbed(scene, folder / "undisturbed")
+    output, faults, killed = folder / "killed", [], 0
+    while killed < times:
+        process = scene.start(output)
+        wait = rng.uniform(0.0, before + span)
+        if rng.random() >= AT_START:
+            wait_for_a_file(process, output)
+            wait = rng.uniform(0.0, span)
+        try:
+            process.wait(wait)
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal.SIGKILL)
+            killed += 1
+        said, code = finish(process)
+        faults += half_written(output)
+        if code == 0:
+            if scene.result(output) != wanted:
+                faults.append("the result differs from that of a run that was not killed")
+            shutil.rmtree(output)
+        elif code != -signal.SIGKILL:
+            faults.append(f"exit code {code}: {said[-300:]}")
+            shutil.rmtree(output, ignore_errors=True)
+    said, code = finish(scene.start(output))
+    if code != 0 or scene.result(output) != wanted:
+        faults.append(f"after the last kill: exit code {code}: {said[-300:]}")
+    return faults
+
+
+def fill(scene: Scene, folder: Path, times: int, rng: random.Random) -> list[str]:
+    """Run a command on disks that become full; then it continues on a larger one. Returns the faults."""
+    wanted, *_ = undisturbed(scene, folder / "undisturbed")
+    needed = sum(path.stat().st_size for path in (folder / "undisturbed").rglob("*") if path.is_file())
+    faults, disk = [], folder / "disk"
+    disk.mkdir()
+    for _ in range(times):
+        size = rng.randrange(2**14, needed)
+        subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "none", str(disk)], check=True)
+        try:
+            output = disk / "output"
+            said, code = finish(scene.start(output))
+            if code == 2 and (not said.splitlines()[-1].startswith("error: ") or "Traceback" in said):
+                faults.append(f"{size} bytes: {said[-300:]}")
+            if code not in (0, 2):
+                faults.append(f"{size} bytes: exit code {code}: {said[-300:]}")
+            faults += [f"{size} bytes: {fault}" for fault in half_written(output)]
+            subprocess.run(["mount", "-o", f"remount,size={TMPFS}", str(disk)], check=True)
+            if code != 0:
+                said, code = finish(scene.start(output))
+            if code != 0 or scene.result(output) != wanted:
+                faults.append(f"{size} bytes, then more: exit code {code}: {said[-300:]}")
+        finally:
+            subprocess.run(["umount", str(disk)], check=True)
+    return faults
+
+
+def inputs(family: str, times: int, keep: Path) -> list[str]:
+    """Read so many mutations of a family; returns the faults."""
+    journal = keep / f"{family}.jsonl"
+    journal.unlink(missing_ok=True)
+    done, faults = 0, []
+    while done < times:
+        program = [sys.executable, str(Path(__file__).with_name("mutations.py")), family, str(done), str(times)]
+        code = subprocess.run([*program, str(journal)], env=os.environ | {"PYTHONPATH": str(ROOT)}).returncode
+        last = read_rows(journal)[-1]
+        if "begun" in last:
+            faults.append(f"{last['begun']}: it ends the process, exit code {code}")
+        done = 1 + last.get("ended", last.get("begun"))
+    return faults + [f"{row['ended']}: {row['fault']}" for row in read_rows(journal) if row.get("fault")]
+
+
+def main() -> int:
+    """The command; returns its exit code."""
+    parser = argparse.ArgumentParser(prog="make soak", description="Kill, fill and mutate.")
+    parser.add_argument("part", nargs="*", help="kill, full, inputs (default: all)")
+    parser.add_argument("--times", type=int, default=50, help="kills, disks and mutations of each kind (default: 50)")
+    parser.add_argument("--only", nargs="+", help="commands of kill and full, families of inputs")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--keep", type=Path, default=Path("runs/soak"), help="folder for inputs with a fault")
+    given = parser.parse_args()
+    parts, rng, found = given.part or ["kill", "full", "inputs"], random.Random(given.seed), {}
+    if "full" in parts and "SOAK_NAMESPACE" not in os.environ:  # to mount disks; its own, nobody else sees them
+        os.execvpe("unshare", ["unshare", "-rm", sys.executable, *sys.argv], os.environ | {"SOAK_NAMESPACE": "1"})
+    with tempfile.TemporaryDirectory() as name:
+        commands = scenes(Path(name)) if {"kill", "full"} & set(parts) else {}
+        for part, disturb in (("kill", kill), ("full", fill)):
+            for command, scene in commands.items() if part in parts else ():
+                if not given.only or command in given.only:
+                    folder = Path(name) / f"{part}-{command}"
+                    folder.mkdir()
+                    found[f"{part} {command}"] = disturb(scene, folder, given.times, rng)
+                    print(
+                        f"{part} {command}: {given.times} times, {len(found[f'{part} {command}'])} faults", flush=True
+                    )
+    if "inputs" in parts:
+        given.keep.mkdir(parents=True, exist_ok=True)
+        families = [family for family in (*FAMILIES, "flags", "code") if not given.only or family in given.only]
+        mutated = inputs(families, given.times, given.keep)
+        print(
+            "\n".join(
+                f"inputs {family}: {given.times} times, {len(faults)} faults" for family, faults in mutated.items()
+            )
+        )
+        found |= mutated
+    faults = [f"{where}: {fault}" for where, some in found.items() for fault in some]
+    print("\n".join([*faults, f"{len(faults)} faults"]))
+    return 1 if faults else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
