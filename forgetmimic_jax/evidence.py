@@ -39,7 +39,7 @@ class Options:
     recovery_iterations: int | None = None
     """Iterations of the fine-tuning on the kept clips alone; 100 by default."""
     relearning_iterations: int | None = None
-    """Iterations of relearning at most; 300 by default."""
+    """Iterations of relearning at most; 200 by default, with --full 300."""
     control_iterations: int | None = None
     """Iterations of a control that is made; the method's by default."""
     fakes: bool = False
@@ -116,7 +116,7 @@ def main(options: Options) -> None:
     if options.fakes:
         _judge_fakes(options, case, parts, document, info, base.path)
     given = {field.name: getattr(options, field.name) or None for field in dataclasses.fields(options)}
-    command = command_line("evidence", **{name.replace("_", "-"): value for name, value in given.items()})
+    command = command_line("evidence", **given)
     text = page(document, files["figure"].name, command, read_judged(run / JUDGED))
     write_atomically(files["page"], text.encode())
     verdict = judge(document)

@@ -76,7 +76,7 @@ def test_the_page_has_every_attack_and_the_command(run, printed):
     for said in (
         *("# Evidence: turn forgotten by arft (G1)", "## Near-duplicates", "## Splices", "## Look-alikes"),
         *("## Fine-tuning on the kept clips alone", "## Relearning", "## Other numerics", "## Membership"),
-        *("## Without terminations", "## The rule", "![What brought it back](evidence.png)", "--recovery-iterations"),
+        *("## Without terminations", "## The rule", "![What brought it back](evidence.png)", "RECOVERY_ITERATIONS=1"),
     ):
         assert said in text, said
     assert (run / "evidence.png").read_bytes().startswith(b"\x89PNG")
