@@ -98,12 +98,8 @@ def main(options: Options) -> None:
     write_atomically(output / "contact_sheet.png", film.contact_sheet(sheet))
     Console().print(_table(episodes))
     files = {"films": output / "*.mp4", "for pages": output / "*.gif", "all clips": output / "contact_sheet.png"}
-    closing(
-        files,
-        command_line(
-            "play", robot=options.robot, checkpoint=options.checkpoint, base=options.base, library=options.library
-        ),
-    )
+    shown = {name: getattr(options, name) for name in ("robot", "checkpoint", "base", "beside", "library")}
+    closing(files, command_line("play", **shown))
 
 
 def _table(episodes: Sequence[Episode]):
