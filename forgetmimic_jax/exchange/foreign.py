@@ -125,7 +125,7 @@ def _clip(
     elif motion:
         clip, file, source = clips.clip_beside(motion, reading.fps, robot), motion, f"{motion.name} beside the file"
     else:
-        return None, None, Row("clip", "none", "no clip in the file, and not one .csv or .npz beside it")
+        return None, None, Row("clip", "those of --library", "not in the file, and not one .csv or .npz beside it")
     clip = rounded(clips.from_second(clip, reading.start))
     return clip, file, Row("clip", f"{clip.name}, {clip.num_frames} frames, {clip.seconds:.1f} s", source)
 

@@ -168,7 +168,7 @@ def scripted(evaluator: Evaluator, terminated: dict[int, list[int]], diverged: d
 
         broken = marks(terminated) | marks(diverged)
         reward = np.repeat(steps[:, None], envs, axis=1).astype(np.float32)
-        causes = {"orientation": marks(terminated), "contact_force": marks({1: [9, 60]})}
+        causes = {"orientation": marks(terminated), "contact_force": marks({0: [20], 1: [60]})}
         return state, {
             "tracking_reward": reward,
             "terminated": broken,

@@ -93,7 +93,7 @@ def test_the_table_says_what_was_taken_from_where_and_each_missing_key(mjlab, la
     assert said["joint order"] == "joint_names, deploy.yaml"
     assert said["anchor body"] == "assumed: no anchor_body_name; g1's"
     assert values(read(lab, robot))["network"] == "154-16-29, no normaliser"
-    assert values(read(lab, robot))["clip"] == "none"
+    assert values(read(lab, robot))["clip"] == "those of --library"
     assert sources(read(wbc, robot))["stiffness"] == "joint_stiffness, config.yaml"
     assert values(read(wbc, robot))["action"] == "residual: target = reference joints + scale · action"
 
