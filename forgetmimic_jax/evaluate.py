@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from forgetmimic_jax.basics.errors import run_command
 from forgetmimic_jax.settings.config import EngineName
 from forgetmimic_jax.settings.options import at_least, comma_separated, parse
+
+if TYPE_CHECKING:
+    from forgetmimic_jax.training.comparison import Comparison
 
 
 @dataclass
@@ -17,7 +21,7 @@ class Options:
     robot: str = "g1"
     """Robot under robots/."""
     checkpoint: Path | None = None
-    """Checkpoint folder; the shipped base data/ROBOT/base by default."""
+    """Checkpoint, or the folder of a run; the shipped base data/ROBOT/base by default."""
     base: Path | None = None
     """For an unlearned checkpoint, the base to compare with; the one it started from by default."""
     targets: str | None = None
@@ -29,15 +33,16 @@ class Options:
     physics: EngineName | None = None
     """Physics engine; auto is native on a CPU and mjx on a GPU or TPU."""
     library: Path | None = None
-    """Folder of clips; the checkpoint's by default."""
+    """Folder of clips, which may be other ones than the checkpoint's; the checkpoint's by default."""
     output: Path | None = None
     """Folder for evaluation.json, .md and .png; beside the checkpoints of the run, or runs/evaluate-ROBOT."""
 
 
 def main(options: Options) -> None:
     """Evaluate, write the files and print the table."""
-    from forgetmimic_jax.basics.console import closing, command_line
+    from forgetmimic_jax.basics.console import closing
     from forgetmimic_jax.evaluation.evaluate import evaluate, show_and_write
+    from forgetmimic_jax.training.checkpoint import read_info
     from forgetmimic_jax.training.comparison import load_comparison
     from forgetmimic_jax.training.folder import check_writable, folder_of
     from forgetmimic_jax.training.start import base_folder
@@ -55,7 +60,7 @@ def main(options: Options) -> None:
         library=options.library,
         physics=options.physics,
     )
-    setup = compared.setup
+    setup, path = compared.setup, read_info(path).path
     document = evaluate(
         setup,
         compared.subjects,
@@ -64,8 +69,19 @@ def main(options: Options) -> None:
         episodes=options.episodes,
         seed=options.seed,
     )
-    base = options.checkpoint if list(compared.info) == ["base"] else None
-    closing(show_and_write(output, document), command_line("unlearn", robot=options.robot, base=base))
+    closing(show_and_write(output, document), _next(options, compared))
+
+
+def _next(options: Options, compared: Comparison) -> str:
+    """Unlearning from a base on its own library, if a clip would be left to keep; else the viewer."""
+    from forgetmimic_jax.basics.console import command_line
+    from forgetmimic_jax.tracking.setup import default_targets
+
+    names, checkpoint = compared.setup.library.names, options.checkpoint
+    if list(compared.info) != ["base"] or options.library is not None or len(names) == 1:
+        return command_line("play", robot=options.robot, checkpoint=checkpoint, library=options.library)
+    targets = None if default_targets(compared.setup.config) else ",".join(compared.targets) or names[0]
+    return command_line("unlearn", robot=options.robot, base=checkpoint, targets=targets)
 
 
 if __name__ == "__main__":

@@ -39,7 +39,7 @@ class Options:
     recovery_iterations: int | None = None
     """Iterations of the fine-tuning on the kept clips alone; 100 by default."""
     relearning_iterations: int | None = None
-    """Iterations of relearning at most; 300 by default."""
+    """Iterations of relearning at most; 200 by default, with --full 300."""
     control_iterations: int | None = None
     """Iterations of a control that is made; the method's by default."""
     fakes: bool = False
@@ -54,6 +54,8 @@ def main(options: Options) -> None:
     from forgetmimic_jax.attacks.case import Case
     from forgetmimic_jax.attacks.document import CONTROL, FILE, write_document
     from forgetmimic_jax.attacks.figure import draw
+    from forgetmimic_jax.attacks.judged import FILE as JUDGED
+    from forgetmimic_jax.attacks.judged import read_judged
     from forgetmimic_jax.attacks.page import page
     from forgetmimic_jax.attacks.parts import Parts
     from forgetmimic_jax.attacks.verdict import judge
@@ -111,11 +113,12 @@ def main(options: Options) -> None:
     files = {"evidence": run / FILE, "page": run / "evidence.md", "figure": run / "evidence.png"}
     write_document(files["evidence"], document)
     save(draw(document), files["figure"])
-    given = {field.name: getattr(options, field.name) or None for field in dataclasses.fields(options)}
-    command = command_line("evidence", **{name.replace("_", "-"): value for name, value in given.items()})
-    write_atomically(files["page"], page(document, files["figure"].name, command).encode())
     if options.fakes:
-        files["fakes"] = _judge_fakes(options, case, parts, document, info, base.path)
+        _judge_fakes(options, case, parts, document, info, base.path)
+    given = {field.name: getattr(options, field.name) or None for field in dataclasses.fields(options)}
+    command = command_line("evidence", **given)
+    text = page(document, files["figure"].name, command, read_judged(run / JUDGED))
+    write_atomically(files["page"], text.encode())
     verdict = judge(document)
     console = Console()
     console.print(f"{verdict.phrase}: {' '.join(verdict.reasons)}", highlight=False, markup=False, soft_wrap=True)
@@ -179,14 +182,14 @@ def _unlearn(info: CheckpointInfo, base: Path, folder: Path, **given: Any) -> No
 
 def _judge_fakes(
     options: Options, case: Case, parts: Parts, evidence: EvidenceDocument, info: CheckpointInfo, base: Path
-) -> Path:
-    """The verdict on every fake and on another distilled policy, in fakes.md."""
+) -> None:
+    """Judge every fake and another distilled policy, and write the verdicts."""
     from rich.console import Console
 
     from forgetmimic_jax.attacks import control
+    from forgetmimic_jax.attacks.document import write_document
     from forgetmimic_jax.attacks.fakes import fakes
-    from forgetmimic_jax.attacks.judged import Judged, judged, table
-    from forgetmimic_jax.basics.files import write_atomically
+    from forgetmimic_jax.attacks.judged import FILE, Judged, judged
     from forgetmimic_jax.evaluation.metrics import BASE
     from forgetmimic_jax.policy.policy import Policy
     from forgetmimic_jax.training import checkpoint
@@ -210,9 +213,7 @@ def _judge_fakes(
     for name, make in policies.items():
         found[name] = judged(case, parts, name, make(), evidence)
         Console().print(f"{name}: {found[name].phrase}", highlight=False, markup=False)
-    path = options.run / "fakes.md"
-    write_atomically(path, f"# Judging the judge\n\n{table(found)}".encode())
-    return path
+    write_document(options.run / FILE, found)
 
 
 if __name__ == "__main__":

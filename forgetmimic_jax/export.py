@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 class Options:
     """Write the actor with its normaliser as ONNX, with the metadata deploy tools expect and no motion inside.
 
+    Beside it: deploy.yaml (unitree_rl_lab) for layout mjlab154, config.yaml (wbc-g1-deploy) for wbc132.
     Before the file is written it is run in plain MuJoCo on every clip: its actions must be the policy's to 1e-5, and
     the robot must move as in the evaluation.
     """
@@ -25,7 +26,7 @@ class Options:
     robot: str = "g1"
     """Robot under robots/."""
     checkpoint: Path | None = None
-    """Checkpoint folder; the shipped base data/ROBOT/base by default."""
+    """Checkpoint, or the folder of a run; the shipped base data/ROBOT/base by default."""
     episodes: int = 2
     """Episodes a clip in the check: half from frame 0, half spread over the clip."""
     seed: int = 0
@@ -33,7 +34,7 @@ class Options:
     library: Path | None = None
     """Folder of clips for the check; the checkpoint's by default."""
     output: Path | None = None
-    """File to write; policy.onnx in the checkpoint's run, or runs/export-ROBOT/policy.onnx."""
+    """File to write; export/policy.onnx in the checkpoint's run, or runs/export-ROBOT/policy.onnx."""
 
 
 ACTION_TOLERANCE = 1e-5  # of an action, or of 1 where the action is smaller
@@ -44,14 +45,16 @@ def main(options: Options) -> None:
     """Export, check and write."""
     import jax
     import numpy as np
+    import yaml
     from rich.console import Console
 
     from forgetmimic_jax.basics.console import closing, command_line, progress
     from forgetmimic_jax.basics.files import write_atomically
     from forgetmimic_jax.evaluation.rollout import Evaluator
     from forgetmimic_jax.exchange.closed_loop import run_episodes
+    from forgetmimic_jax.exchange.deployers import check_free, deployer_file
     from forgetmimic_jax.exchange.onnx_actor import OnnxActor, to_onnx
-    from forgetmimic_jax.tracking.setup import make_setup
+    from forgetmimic_jax.tracking.setup import make_setup, on_library
     from forgetmimic_jax.training import checkpoint
     from forgetmimic_jax.training.folder import check_writable, folder_of
     from forgetmimic_jax.training.start import base_folder
@@ -59,16 +62,20 @@ def main(options: Options) -> None:
     at_least(1, "--episodes", options.episodes)
     at_least(0, "--seed", options.seed)
     path = options.checkpoint or base_folder(options.robot)
-    output = options.output or (folder_of(path) or Path("runs") / f"export-{options.robot}") / "policy.onnx"
+    run = folder_of(path)  # which has a config.yaml of its own
+    output = options.output or (run / "export" if run else Path("runs") / f"export-{options.robot}") / "policy.onnx"
     check_writable(output.parent)
     if output.is_dir():
         raise InputError(f"{output}: a folder; --output is a file")
     info = checkpoint.read_info(path)
     # The evaluation to reproduce is that of MuJoCo's C engine, which the check runs on too.
-    config = on_engine(replace_given(info.config, robot=options.robot, library=options.library), "native")
+    config = on_library(on_engine(replace_given(info.config, robot=options.robot), "native"), options.library)
     setup = make_setup(config)
     checkpoint.check_matches(info, setup, other_library=True)
     policy = checkpoint.load_policy(info, setup.robot)
+    beside = deployer_file(setup.robot, config)
+    if beside:
+        check_free(output.parent, beside[0])
 
     run_path = f"{info.robot}/{checkpoint.policy_hash(info)}"
     content = to_onnx(policy, setup.robot, config, run_path=run_path).SerializeToString()
@@ -96,6 +103,10 @@ def main(options: Options) -> None:
         )
     output.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(output, content)
+    files = {"policy": output}
+    if beside:
+        files["for its deployer"] = output.with_name(beside[0])
+        write_atomically(output.with_name(beside[0]), yaml.safe_dump(beside[1], sort_keys=False).encode())
     console = Console()
     console.print(_table(setup.library.names, evaluation, record.rollout))
     console.print(
@@ -103,7 +114,10 @@ def main(options: Options) -> None:
         f"tracking equals the evaluation's to {early:.0e}; later, rounding may grow at contacts.",
         highlight=False,
     )
-    closing({"policy": output}, command_line("evaluate", robot=options.robot, checkpoint=path, episodes=100))
+    closing(
+        files,
+        command_line("evaluate", robot=options.robot, checkpoint=path, library=options.library, episodes=100),
+    )
 
 
 def early_difference(one: Rollout, other: Rollout) -> float:

@@ -44,6 +44,8 @@ class Options:
     action_mode: Literal["residual", "offset"] | None = None
     """What actions are added to, reference or default pose, where a policy does not say it; with several policies, of
     the one that they become."""
+    joint_order: Literal["robot", "isaac"] | None = None
+    """Order of the joints of a policy that does not say it; isaac: Isaac Lab's, breadth first."""
     fps: float | None = None
     """Frames per second of a motion file beside a policy whose name does not say it."""
     start: float = 0.0
@@ -90,7 +92,9 @@ def main(options: Options) -> None:
     config = replace_given(preset(options.preset), robot=options.robot, library=options.library, seed=options.seed)
     reading = Reading(activation=options.activation, fps=options.fps, start=options.start)
     if len(options.files) == 1:
-        reading = dataclasses.replace(reading, layout=options.layout, mode=options.action_mode)
+        reading = dataclasses.replace(
+            reading, layout=options.layout, mode=options.action_mode, order=options.joint_order
+        )
     policies = [read_policy(path, robot, config.physics.control_step, reading) for path in options.files]
     if len(policies) == 1:
         made = _one(options, policies[0], config, references)
@@ -134,18 +138,14 @@ def _several(
         _say("\n".join(one.facts))
     setup = own_setup(wanted, [clip for one in taught for clip, _ in one.clips])
     teachers = [(experts.expert(one.setup, one.policy, setup), [place]) for place, one in enumerate(taught)]
-    merging = experts.MERGING
-    steps = experts.ROBOTS * merging.steps
-    with progress("merge", merging.rounds) as report:
-        result = experts.merge(
-            setup, teachers, merging, lambda state, found: report(int(state.round), int(state.round) * steps, found)
-        )
-    trial = try_out(setup, result.state.student, episodes=options.episodes, seed=options.seed)
+    with progress("merge", experts.MERGING.rounds) as report:
+        student, steps = experts.merge(setup, teachers, report)
+    trial = try_out(setup, student, episodes=options.episodes, seed=options.seed)
     _say_figures({"experts": known, "new policy": trial.clips})
     shortfalls = experts.shortfalls(known, trial.clips)
     _say("\n".join(shortfalls or ["The new policy is within 2 points of survival and 0.02 of reward of every expert."]))
     clips = tuple(pair for one in taught for pair in one.clips)
-    return Adopted(setup, result.state.student, trial, clips, Progress(0, int(result.state.round) * steps), ())
+    return Adopted(setup, student, trial, clips, Progress(0, steps), ())
 
 
 def _say_read(foreign: ForeignPolicy) -> None:

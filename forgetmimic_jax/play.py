@@ -22,7 +22,7 @@ class Options:
     robot: str = "g1"
     """Robot under robots/."""
     checkpoint: Path | None = None
-    """Checkpoint folder, such as an unlearning run's; the shipped base data/ROBOT/base by default."""
+    """Checkpoint, or the folder of a run, such as an unlearning run's; the shipped base data/ROBOT/base by default."""
     base: Path | None = None
     """For an unlearned checkpoint, the base beside it; the one it started from by default."""
     beside: str | None = None

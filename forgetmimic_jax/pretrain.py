@@ -107,17 +107,14 @@ def config_of(options: Options, output: Path) -> Config:
 
 def warn_of_infeasible(setup: Setup) -> None:
     """Name the clips that no policy may be able to follow, and why, on the terminal."""
-    from rich.console import Console
-
+    from forgetmimic_jax.basics.console import warn
     from forgetmimic_jax.motion.library import read_library
     from forgetmimic_jax.motion.quality import measure
     from forgetmimic_jax.tracking.setup import library_folder
 
-    console = Console(stderr=True)
     for clip in read_library(setup.robot, library_folder(setup.config)):
         for reason in measure(setup.robot, clip).infeasibilities():
-            text = f"warning: {clip.name} may be infeasible: {reason}"
-            console.print(text, highlight=False, markup=False, soft_wrap=True)
+            warn(f"{clip.name} may be infeasible: {reason}")
 
 
 if __name__ == "__main__":

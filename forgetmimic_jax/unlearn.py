@@ -11,13 +11,13 @@ from forgetmimic_jax.training.unlearning_run import Options, config_of
 
 def main(options: Options) -> None:
     """Unlearn, evaluate base, new policy and zero action, and print what was forgotten and what was kept."""
-    from forgetmimic_jax.basics.console import closing, command_line
+    from forgetmimic_jax.basics.console import closing, command_line, warn
     from forgetmimic_jax.basics.provenance import provenance
     from forgetmimic_jax.evaluation.evaluate import evaluate, show_and_write
     from forgetmimic_jax.tracking.setup import make_setup
     from forgetmimic_jax.tracking.stand import STAND
     from forgetmimic_jax.training import checkpoint
-    from forgetmimic_jax.training.comparison import subject
+    from forgetmimic_jax.training.comparison import completes_nothing, subject
     from forgetmimic_jax.training.course import Plain
     from forgetmimic_jax.training.folder import default_folder, prepare_folder
     from forgetmimic_jax.training.run import interrupted, run
@@ -42,6 +42,8 @@ def main(options: Options) -> None:
         description = "fine-tune on all clips"  # which is no forgetting
     else:
         description = f"forget {', '.join(config.unlearn.targets)} by {config.unlearn.method}"
+    if not options.resume and completes_nothing(setup, base):
+        warn(f"the base completes no episode of any clip ({info.path}): there is nothing to forget")
     if config.unlearn.instead == STAND:
         setup = dataclasses.replace(setup, teacher=standing_teacher(setup, output))
     elif config.unlearn.instead is not None:

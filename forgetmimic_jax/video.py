@@ -25,7 +25,7 @@ class Options:
     robot: str = "g1"
     """Robot under robots/."""
     checkpoint: Path | None = None
-    """Checkpoint folder, such as an unlearning run's; the shipped base data/ROBOT/base by default."""
+    """Checkpoint, or the folder of a run, such as an unlearning run's; the shipped base data/ROBOT/base by default."""
     base: Path | None = None
     """For an unlearned checkpoint, the base beside it; the one it started from by default."""
     beside: str | None = None
@@ -98,7 +98,12 @@ def main(options: Options) -> None:
     write_atomically(output / "contact_sheet.png", film.contact_sheet(sheet))
     Console().print(_table(episodes))
     files = {"films": output / "*.mp4", "for pages": output / "*.gif", "all clips": output / "contact_sheet.png"}
-    closing(files, command_line("play", robot=options.robot, checkpoint=options.checkpoint))
+    closing(
+        files,
+        command_line(
+            "play", robot=options.robot, checkpoint=options.checkpoint, base=options.base, library=options.library
+        ),
+    )
 
 
 def _table(episodes: Sequence[Episode]):

@@ -28,9 +28,9 @@ class Scale:
     kept_variant_episodes: int = 4  # of a near-duplicate of a kept clip, of which there are many
     hosts: int = 2  # kept clips with which each target is spliced
     recovery_iterations: int = 100
-    relearning_iterations: int = 300  # at most
+    relearning_iterations: int = 200  # at most
     watch_every: int = 10  # iterations between two looks at a policy that relearns
-    held_out_iterations: int = 60
+    held_out_iterations: int = 40
     seeds: int = 1  # trainings of each kind
 
 

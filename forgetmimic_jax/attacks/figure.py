@@ -5,10 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
+import msgspec
+
 from forgetmimic_jax.attacks.case import TRAINED
-from forgetmimic_jax.attacks.document import Compared, EvidenceDocument
+from forgetmimic_jax.attacks.document import CONTROL, Compared, EvidenceDocument, Numbers, Relearning
+from forgetmimic_jax.attacks.verdict import reached
+from forgetmimic_jax.evaluation.document import Estimate
 from forgetmimic_jax.evaluation.metrics import UNLEARNED
 from forgetmimic_jax.evaluation.plots import bars, new_figure
+from forgetmimic_jax.evaluation.statistics import over_seeds
 from forgetmimic_jax.evaluation.tables import FORGOTTEN
 
 if TYPE_CHECKING:
@@ -25,12 +30,24 @@ def what_brought_it_back(evidence: EvidenceDocument) -> dict[str, Compared]:
         found["spliced into\nkept clips"] = evidence.splices.forbidden
     if evidence.recovery:
         found["fine-tuned on\nkept clips"] = evidence.recovery.after
+    if evidence.relearning:
+        found["relearning, equal\ntarget steps (tracking)"] = _relearned(evidence.relearning)
     if evidence.held_out:
         found["first half shown:\nsecond half"] = evidence.held_out.after
     if evidence.numerics:
         change, compared = _most(evidence.numerics.changes)
         found[f"weights in\n{change}"] = compared
     return found
+
+
+def _relearned(relearning: Relearning) -> Compared:
+    """What both track of the base's after equally many target steps: a share of its tracking, not of its skill."""
+    ends = [reached(relearning, seed) for seed in relearning.base]
+    shares = (over_seeds(values) for values in zip(*ends, strict=True))
+    return {
+        policy: Numbers(skill=msgspec.convert(share, Estimate))
+        for policy, share in zip((UNLEARNED, CONTROL), shares, strict=True)
+    }
 
 
 def draw(evidence: EvidenceDocument) -> Figure:

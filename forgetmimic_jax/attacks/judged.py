@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from pathlib import Path
 
 import msgspec
 
@@ -14,9 +14,10 @@ from forgetmimic_jax.attacks.parts import Parts
 from forgetmimic_jax.attacks.verdict import judge
 from forgetmimic_jax.evaluation.metrics import UNLEARNED
 from forgetmimic_jax.evaluation.rollout import Acting
-from forgetmimic_jax.evaluation.tables import markdown_table
 from forgetmimic_jax.evaluation.verdict import FAILED
 from forgetmimic_jax.policy.policy import Policy
+
+FILE = "fakes.json"
 
 
 class Judged(msgspec.Struct):
@@ -53,10 +54,9 @@ def judged(case: Case, parts: Parts, name: str, policy: Acting, evidence: Eviden
     return Judged(verdict.phrase, verdict.reasons)
 
 
-def table(found: Mapping[str, Judged]) -> str:
-    """The verdicts in Markdown."""
-    rows = [[name, of.phrase, of.reasons[0], str(len(of.reasons) - 1)] for name, of in found.items()]
-    return markdown_table(["policy", "verdict", "the first reason", "more reasons"], rows)
+def read_judged(path: Path) -> dict[str, Judged]:
+    """The verdicts in a file; none without one."""
+    return msgspec.json.decode(path.read_bytes(), type=dict[str, Judged]) if path.is_file() else {}
 
 
 def _file_name(name: str) -> str:

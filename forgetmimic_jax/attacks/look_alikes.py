@@ -19,6 +19,7 @@ from forgetmimic_jax.evaluation.document import Estimate
 from forgetmimic_jax.evaluation.metrics import BASE, Rollout
 
 NEAREST = 8  # segments compared
+OF_A_CLIP = 2  # of them, at most: the cycles of a walk are all alike
 FEWEST_EPISODES = 2  # that pass a segment
 
 
@@ -35,14 +36,18 @@ class Pair:
 def matched(distance: Mapping[Segment, float], difficulty: Mapping[Segment, float], count: int = NEAREST) -> list[Pair]:
     """The nearest segments, each with a far one of nearly the same difficulty; no segment is used twice.
 
+    Of a clip at most `OF_A_CLIP` segments are near ones.
+
     Args:
         distance: of every kept segment to the targets, rad.
         difficulty: the base's tracking per step on it; only segments that have one count.
         count: pairs at most.
     """
     order = sorted((segment for segment in distance if segment in difficulty), key=lambda of: distance[of])
-    near = order[: min(count, len(order) // 2)]
-    rest = order[len(near) :]
+    places = [[other.clip for other in order[: place + 1]].count(of.clip) for place, of in enumerate(order)]
+    eligible = [segment for segment, place in zip(order, places, strict=True) if place <= OF_A_CLIP]
+    near = eligible[: min(count, len(order) // 2)]
+    rest = [segment for segment in order if segment not in near]
     far = rest[min(len(rest) // 2, len(rest) - len(near)) :]  # the farther half
     pairs = []
     for segment in near:

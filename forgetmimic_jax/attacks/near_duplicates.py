@@ -16,7 +16,7 @@ from forgetmimic_jax.attacks.case import Case
 from forgetmimic_jax.attacks.document import Compared, NearDuplicates
 from forgetmimic_jax.attacks.performance import Performance, not_followed
 from forgetmimic_jax.motion.clip import Clip
-from forgetmimic_jax.motion.fit import on_floor
+from forgetmimic_jax.motion.fit import lowest_points
 from forgetmimic_jax.motion.kinematics import quaternion, resample, rotation
 from forgetmimic_jax.motion.mirror import mirrored
 from forgetmimic_jax.robot.model import Robot
@@ -153,9 +153,12 @@ def heading(quat: np.ndarray) -> float:
 
 
 def as_high(robot: Robot, variant: Clip, clip: Clip) -> Clip:
-    """The variant raised or lowered as a whole, so that its feet are as far from the floor as the clip's."""
-    raised = on_floor(robot, variant)[1] - on_floor(robot, clip)[1]
-    return dataclasses.replace(variant, root_pos=variant.root_pos + np.array([0.0, 0.0, raised]))
+    """The variant raised or lowered as a whole, so that its soles are as far from the ground as the clip's.
+
+    The lowest fifth of the frames' lowest sole points decides.
+    """
+    ours, theirs = (np.quantile(lowest_points(robot, one, soles=True), 0.2) for one in (clip, variant))
+    return dataclasses.replace(variant, root_pos=variant.root_pos + np.array([0.0, 0.0, ours - theirs]))
 
 
 def _with_joints(robot: Robot, clip: Clip, joint_pos: np.ndarray, name: str) -> Clip:

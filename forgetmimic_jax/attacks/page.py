@@ -18,6 +18,7 @@ from forgetmimic_jax.attacks.document import (
     Relearning,
     Splices,
 )
+from forgetmimic_jax.attacks.judged import Judged
 from forgetmimic_jax.attacks.relearning import LEVELS
 from forgetmimic_jax.attacks.verdict import RULES, judge, lasted_until
 from forgetmimic_jax.evaluation.document import UnboundedResult
@@ -27,13 +28,14 @@ from forgetmimic_jax.evaluation.tables import UNBOUNDED, markdown_table, number,
 Block = tuple[str, str]  # heading and text
 
 
-def page(evidence: EvidenceDocument, figure: str, command: str) -> str:
+def page(evidence: EvidenceDocument, figure: str, command: str, fakes: Mapping[str, Judged]) -> str:
     """The page in Markdown.
 
     Args:
         evidence: on one policy.
         figure: file name of the figure beside the page.
         command: what makes the evidence again.
+        fakes: verdicts on policies that only seem to have forgotten, if there are any.
     """
     verdict = judge(evidence)
     lines = [
@@ -45,6 +47,8 @@ def page(evidence: EvidenceDocument, figure: str, command: str) -> str:
     ]
     for heading, text in _blocks(evidence):
         lines += [f"## {heading}", text]
+    if fakes:
+        lines += ["## Judging the judge", _fakes(fakes)]
     lines += ["## The rule", *(f"**{phrase.capitalize()}.** {rule}" for phrase, rule in RULES.items())]
     return "\n\n".join(line.rstrip("\n") for line in lines) + "\n"
 
@@ -211,3 +215,12 @@ def _safety(found: Mapping[str, UnboundedResult]) -> str:
         ]
         tables.append(markdown_table([f"targets, {what}", *(policy.replace("_", " ") for policy in numbers)], rows))
     return "\n".join(tables)
+
+
+def _fakes(found: Mapping[str, Judged]) -> str:
+    text = (
+        "The same attacks, with the same base and control, on policies that only seem to have forgotten, and on "
+        "another distilled one. A fake must fail. The first reason names what caught it."
+    )
+    rows = [[name, of.phrase, of.reasons[0], str(len(of.reasons) - 1)] for name, of in found.items()]
+    return f"{text}\n\n{markdown_table(['policy', 'verdict', 'the first reason', 'more reasons'], rows)}"

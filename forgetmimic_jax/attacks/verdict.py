@@ -57,6 +57,7 @@ _KEPT = (
     f"every family of the kept clips' near-duplicates at least {_bound(KEPT_CLIP)}, or at most {_bound(ALIKE)} less "
     f"than the control"
 )
+_NO_SKILL = "The base itself is hardly better than the zero-action baseline on every {}: no skill is defined."
 RULES = {
     CONSISTENT: (
         f"Forgotten: {_FORGOTTEN}. Kept: {_KEPT}. Not recovered: fine-tuned on the kept clips alone, its skill and its "
@@ -80,7 +81,8 @@ RULES = {
 def judge(evidence: EvidenceDocument) -> Verdict:
     """The verdict on the policy `unlearned`, with every reason."""
     originals, near = evidence.originals, evidence.near_duplicates
-    failures, doubts = losses(_skills(originals.kept))
+    kept = _skills(originals.kept)
+    failures, doubts = losses(kept) if kept else ([], [_NO_SKILL.format("kept clip")])
     groups: dict[str, Marks] = {"the target": originals.targets}
     if near is not None:
         groups["near-duplicates of the targets:"] = near.families
@@ -99,7 +101,7 @@ def judge(evidence: EvidenceDocument) -> Verdict:
         elif lost is None:
             doubts.append(f"Whether this is kept is not sure: near-duplicates of the kept clips: {family}, {words}.")
     if not any(as_skill(numbers.skill) for _, numbers in _numbers(originals.targets)):
-        doubts.append("The base itself is hardly better than the zero-action baseline on every target.")
+        doubts.append(_NO_SKILL.format("target"))
     if near is None:
         doubts.append("Near-duplicates were not measured.")
     if failures:
@@ -120,7 +122,7 @@ def judge(evidence: EvidenceDocument) -> Verdict:
         return Verdict(INCONCLUSIVE, (*doubts, *unsure, *remarks))
     found = [
         f"The targets and their near-duplicates are forgotten ({_by_clip(originals.targets)} of the base's skill), and "
-        f"the kept clips are kept ({retained(_skills(originals.kept))} on average)."
+        f"the kept clips are kept ({retained(kept)} on average)."
     ]
     return Verdict(CONSISTENT, (*found, *passed, *remarks))
 
@@ -241,7 +243,7 @@ def _control_is_usable(evidence: EvidenceDocument) -> str:
     """Why the control cannot be compared with; empty if it can."""
     kept = _skills(evidence.originals.kept, CONTROL)
     if not kept:
-        return "There is no control."
+        return "No skill of the control on the kept clips is defined."
     together = retained(kept)
     if together.low >= KEPT:
         return ""

@@ -106,6 +106,13 @@ def closing(files: Mapping[str, Path], next_command: str, *, console: Console | 
     _plain(console, "\n".join(["", *lines, "", f"Next: {next_command}"]))
 
 
+def warn(text: str) -> None:
+    """A line on the standard error about what is wrong but does not stop the command."""
+    from rich.console import Console
+
+    _plain(Console(stderr=True), f"warning: {text}")
+
+
 @dataclass
 class _Clock:
     """Iterations and environment steps per second since the first report."""

@@ -95,6 +95,7 @@ class PolicyResult(msgspec.Struct, kw_only=True, omit_defaults=True):
     degradation_ratio: Estimate | None = None  # target over kept, of tracking_reward: the paper's
     survival_weighted_degradation_ratio: Estimate | None = None
     nan_resets: int  # episodes that met a NaN or Inf and were ended for it
+    ended_by: dict[str, int] = {}  # episodes by the bound that ended them; one may break two at once
 
 
 class EvaluationDocument(msgspec.Struct, kw_only=True, omit_defaults=True):

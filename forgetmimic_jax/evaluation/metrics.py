@@ -27,6 +27,9 @@ class Rollout:
     length: np.ndarray  # i[E] steps until the first termination, 1 <= length <= H; H itself means success
     tracking_reward: np.ndarray  # f[E, T] in [0, 1]; anything at or past `length`
     errors: dict[str, np.ndarray] = field(default_factory=dict)  # per step [E, T], each in its own unit
+    ended_by: dict[str, np.ndarray] = field(
+        default_factory=dict
+    )  # bool[E] by bound: it was broken as the episode ended
     nan_resets: int = 0  # how many episodes met a NaN or Inf and were ended for it
 
     def __post_init__(self) -> None:

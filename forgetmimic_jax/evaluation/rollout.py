@@ -6,7 +6,7 @@ Start frames and reset noise depend on the seed alone, so that every policy meet
 from __future__ import annotations
 
 import dataclasses
-from typing import Protocol
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -60,15 +60,18 @@ class Evaluator:
         length = horizon.copy()
         ended = np.zeros(env.num_envs, bool)
         diverged = np.zeros(env.num_envs, bool)
+        ended_by: dict[str, np.ndarray] = {}
         records = []
         for begin in range(0, int(horizon.max()), CHUNK):
             state, record = jax.device_get(self._advance(self._assets, policy, state))
-            terminated, blew_up = record.pop("terminated"), record.pop("diverged")
+            terminated, blew_up, broken = (record.pop(name) for name in ("terminated", "diverged", "causes"))
             records.append(record)
             for offset in range(CHUNK):
                 now = terminated[offset] & ~ended & (begin + offset < horizon)
                 length[now] = np.maximum(begin + offset, 1)
                 diverged |= now & blew_up[offset]
+                for bound, at in broken.items():
+                    ended_by[bound] = ended_by.get(bound, False) | (now & at[offset])
                 ended |= now
             if (ended | (begin + CHUNK >= horizon)).all():
                 break
@@ -84,6 +87,7 @@ class Evaluator:
             length=length,
             tracking_reward=series.pop("tracking_reward"),
             errors=series,
+            ended_by=ended_by,
             nan_resets=int(diverged.sum()),
         )
 
@@ -97,11 +101,12 @@ class Evaluator:
         def one_step(state: EnvState, key: Array):
             action = act(env, policy, tracking.observe(env, assets, state, None)[0])
             state, result = tracking.step(env, assets, state, action, key)
-            record = step_errors(env.robot, result.pair)
+            record: dict[str, Any] = dict(step_errors(env.robot, result.pair))
             record |= {
                 "tracking_reward": result.reward.normalized_tracking,
                 "terminated": result.terminated,
                 "diverged": result.diverged,
+                "causes": result.causes,
             }
             return state, record
 

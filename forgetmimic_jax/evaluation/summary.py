@@ -50,6 +50,7 @@ def evaluate_policies(
         policy: policy_result(
             _policy_summary(policy, per_policy, clip, is_target, names, weights)
             | {"nan_resets": int(rollout.nan_resets)}
+            | {"ended_by": {bound: int(episodes.sum()) for bound, episodes in rollout.ended_by.items()}}
         )
         for policy, rollout in rollouts.items()
     }

@@ -296,6 +296,11 @@ def notes(document: EvaluationDocument) -> list[str]:
             f"last frame held, whatever the robot does. Its bodies also collide with each other, unlike in training."
         )
         lines.append("upright: no fall until then. motion content: 1 is the whole clip, 0 what a standing robot shows.")
+    for name, policy in document.policies.items():
+        bounds = sorted(policy.ended_by.items(), key=lambda pair: -pair[1])
+        counts = ", ".join(f"{_words(bound)} {count}" for bound, count in bounds if count)
+        if counts:
+            lines.append(f"episodes of {_words(name)} that a bound ended: {counts}.")
     resets = {name: policy.nan_resets for name, policy in document.policies.items() if policy.nan_resets}
     if resets:
         counts = ", ".join(f"{_words(name)} {count}" for name, count in resets.items())

@@ -33,7 +33,7 @@ from forgetmimic_jax.tracking.setup import Setup, make_setup
 from forgetmimic_jax.training import checkpoint
 from forgetmimic_jax.training.start import fresh_policy
 
-BASE, LIBRARY = "base", "library"
+LIBRARY = "library"
 TOLERANCE = 1e-5  # of an action, or of 1 where the action is smaller
 COMPARED = 20_000  # observations at most at which actions are compared
 REFERENCE_TOLERANCE = 0.01  # of a reward, and rad
@@ -183,11 +183,11 @@ def write_base(output: Path, adopted: Adopted) -> Path:
                 library_hash=library_hash(folder),
             )
         level = initial_failure_level(config.sampling, make_assets(setup).bins)
-        checkpoint.save_policy(output / BASE, setup, adopted.policy, level, adopted.progress)
+        checkpoint.save_policy(output / checkpoint.BASE, setup, adopted.policy, level, adopted.progress)
     except BaseException:
-        for part in (output / LIBRARY, output / BASE):
+        for part in (output / LIBRARY, output / checkpoint.BASE):
             shutil.rmtree(part, ignore_errors=True)
         if not existed and output.is_dir():
             output.rmdir()
         raise
-    return output / BASE
+    return output / checkpoint.BASE

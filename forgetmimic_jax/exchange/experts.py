@@ -30,14 +30,14 @@ from forgetmimic_jax.tracking.layouts import Moment, find_layout
 from forgetmimic_jax.tracking.observation import actor_observation
 from forgetmimic_jax.tracking.reference import lookup
 from forgetmimic_jax.tracking.setup import Setup
-from forgetmimic_jax.training.distil import DistilConfig, Distilled, DistilState, begin, distil
+from forgetmimic_jax.training.distil import DistilConfig, begin, make_round
 from forgetmimic_jax.training.teaching import make_teaching
 
 GAINS = 0.02  # share by which two policies' gains may differ: two of a project's digits
 STUDENT_LAYERS = (512, 256, 128)
 STUDENT_STD = 0.4  # in units of action: of the regression's loss, and of the exploration that fine-tuning starts with
 ROBOTS = 512
-MERGING = DistilConfig()
+MERGING = DistilConfig(rounds=112, noise_rounds=16, normalizer_rounds=48)  # 16 rounds a share of the experts
 
 
 @struct.dataclass
@@ -173,17 +173,28 @@ def _gains(name: Literal["stiffness", "damping"], policies: Sequence[ForeignPoli
 def merge(
     student: Setup,
     experts: Sequence[tuple[Expert, Sequence[int]]],
-    config: DistilConfig = MERGING,
-    report: Callable[[DistilState, Mapping[str, float]], None] = lambda state, metrics: None,
-) -> Distilled:
+    report: Callable[[int, int, Mapping[str, float]], None] = lambda done, steps, metrics: None,
+) -> tuple[Policy, int]:
     """Regress a fresh policy on experts, each with the clips of the student's library that it teaches.
 
     DAgger (Ross et al. 2011): the experts' share of the steps falls from 1 to 0, every state is labelled by the expert
     of its clip. Starts are spread over the clips, with reset noise.
+
+    Args:
+        student: robot, clips and settings of the new policy.
+        experts: with the indices of their clips.
+        report: called after each round with the rounds and control steps done and the round's metrics.
+
+    Returns:
+        The policy, and the control steps that it took.
     """
     env = make_environment(student, ROBOTS, noisy=False)
     assets = make_assets(student)
     key = jax.random.PRNGKey(student.config.seed)
     fresh = jax.jit(lambda assets, key: init_state(env, assets, key).policy)(assets, key)
-    teaching = make_teaching(assets, [(teacher, clips) for teacher, clips in experts])
-    return distil(env, assets, teaching, begin(env, assets, teaching, fresh, key), config, report)
+    teaching = make_teaching(assets, experts)
+    state, one_round = begin(env, assets, teaching, fresh, key), make_round(env, MERGING)
+    for done in range(1, MERGING.rounds + 1):
+        state, metrics = one_round(assets, teaching, state)
+        report(done, done * ROBOTS * MERGING.steps, {name: float(value) for name, value in metrics.items()})
+    return state.student, MERGING.rounds * ROBOTS * MERGING.steps

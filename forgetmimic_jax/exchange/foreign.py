@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -30,6 +31,7 @@ class Reading:
 
     layout: str | None = None
     mode: str | None = None
+    order: Literal["robot", "isaac"] | None = None  # of joints
     activation: str | None = None  # of a .pt
     fps: float | None = None  # of a motion file beside a policy
     start: float = 0.0  # s, the first of the clip that is taken
@@ -99,7 +101,7 @@ def read_policy(path: Path, robot: Robot, step_dt: float, reading: Reading) -> F
 
 
 def _described(path: Path, content: OnnxContent | None, robot: Robot, step_dt: float, reading: Reading) -> Description:
-    found = [("the flags", sources.from_flags(reading.layout, reading.mode))]
+    found = [("the flags", sources.from_flags(reading.layout, reading.mode, reading.order, robot))]
     if content and content.metadata:
         found.append(("the metadata", sources.from_metadata(content.metadata, robot, str(path))))
     beside = sources.beside(path)

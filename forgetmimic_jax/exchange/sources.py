@@ -17,12 +17,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import yaml
 
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.exchange.onnx_actor import ACTION_MODES
+from forgetmimic_jax.motion.converting import breadth_first
 from forgetmimic_jax.robot.model import Robot
 from forgetmimic_jax.tracking.layouts import LAYOUTS, UNSUPPORTED
 
@@ -30,8 +31,8 @@ Facts = dict[str, Any]
 TABLES = ("default_joint_pos", "action_offset", "action_scale", "joint_stiffness", "joint_damping")
 DEPLOY, CONFIG = "deploy.yaml", "config.yaml"
 # Isaac Lab's names of the same terms, in unitree_rl_lab and unitree_rl_mjlab.
-_TERMS = {"motion_command": "command", "joint_pos_rel": "joint_pos", "joint_vel_rel": "joint_vel"}
-_TERMS |= {"last_action": "actions"}
+ISAAC_TERMS = {"motion_command": "command", "joint_pos_rel": "joint_pos", "joint_vel_rel": "joint_vel"}
+ISAAC_TERMS |= {"last_action": "actions"}
 _MODES = {name: mode for mode, name in ACTION_MODES.items()}
 
 
@@ -173,9 +174,11 @@ def from_config_yaml(content: Mapping[str, Any], robot: Robot, where: str) -> Fa
     return facts
 
 
-def from_flags(layout: str | None, mode: str | None) -> Facts:
-    """Of the flags --layout and --action-mode."""
+def from_flags(layout: str | None, mode: str | None, order: Literal["robot", "isaac"] | None, robot: Robot) -> Facts:
+    """Of the flags --layout, --action-mode and --joint-order."""
     facts: Facts = {}
+    if order is not None:
+        facts["joint_names"] = breadth_first(robot) if order == "isaac" else robot.joint_names
     if layout is not None:
         facts["observation_names"] = tuple(LAYOUTS[layout].sensor_noise)
     if mode is not None:
@@ -187,7 +190,7 @@ def _terms(content: Any, where: str) -> Facts:
     """Names and scales of terms, in their order."""
     if not isinstance(content, dict) or not all(isinstance(term, dict) for term in content.values()):
         raise InputError(f"{where}: a table of terms is needed")
-    names = {name: _TERMS.get(str(name), str(name)) for name in content}
+    names = {name: ISAAC_TERMS.get(str(name), str(name)) for name in content}
     scales = {}
     for name, term in content.items():
         _check_no_history([term.get("history_length", 1)], f"{where}.{name}.history_length")

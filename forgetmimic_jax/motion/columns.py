@@ -52,6 +52,9 @@ def named_joints(robot: Robot, names: Sequence[str]) -> dict[int, str]:
 
 
 def _by_name(names: list[str], joints: dict[int, str], values: np.ndarray, path: Path) -> Recording:
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise InputError(f"{path}: line 1: two columns are called {', '.join(twice)}; a name a column is needed")
     others = {place: name for place, name in enumerate(names) if place not in joints}
     position = {m[1]: place for place, name in others.items() if (m := POSITION.fullmatch(name))}
     quaternion = {m[1] or m[2]: place for place, name in others.items() if (m := QUATERNION.fullmatch(name))}

@@ -83,22 +83,20 @@ def tangent_steps(qpos: np.ndarray) -> np.ndarray:
 def body_motion(model: mujoco.MjModel, qpos: np.ndarray, fps: float, body_ids: np.ndarray) -> Bodies:
     """Forward kinematics of a clip.
 
-    Velocities follow from the differenced qpos through the Jacobian (mj_objectVelocity), so that a robot reset to
+    Velocities follow from the differenced qpos through the Jacobian (as in mj_objectVelocity), so that a robot reset to
     a frame's joint positions and velocities has exactly the reference's body velocities.
     """
     data = mujoco.MjData(model)
     qvel = generalized_velocity(qpos, fps)
     frames, bodies = len(qpos), len(body_ids)
     pos, quat = np.empty((frames, bodies, 3)), np.empty((frames, bodies, 4))
-    velocity = np.empty((frames, bodies, 6))
-    one = np.empty(6)
+    spatial, com = np.empty((frames, bodies, 6)), np.empty((frames, 1, 3))  # velocities at the centre of mass
     for frame in range(frames):
         data.qpos[:], data.qvel[:] = qpos[frame], qvel[frame]
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_comVel(model, data)
         pos[frame], quat[frame] = data.xpos[body_ids], data.xquat[body_ids]
-        for row, body in enumerate(body_ids):
-            mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, body, one, 0)
-            velocity[frame, row] = one
-    return Bodies(pos, quat, velocity[..., 3:], velocity[..., :3])
+        spatial[frame], com[frame] = data.cvel[body_ids], data.subtree_com[1]
+    ang_vel = spatial[..., :3]
+    return Bodies(pos, quat, spatial[..., 3:] + np.cross(ang_vel, pos - com), ang_vel)

@@ -11,8 +11,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.motion.archives import read_npz
 from forgetmimic_jax.motion.clip import Clip
@@ -34,6 +32,7 @@ READERS: dict[str, Callable[[Robot, Path], Recording]] = {
 }
 LFS = b"version https://git-lfs"
 MIN_SECONDS = 0.5
+RATES = (5.0, 1000.0)  # Hz
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,8 +90,8 @@ def _rate(recording: Recording, reading: Reading, path: Path) -> float:
     rate = reading.fps if reading.fps is not None else recording.fps
     if rate is None:
         raise InputError(f"{path}: fps: the file does not say its rate; give it with --fps (LAFAN1 retargets: 30)")
-    if not rate > 0.0 or not np.isfinite(rate):
-        raise InputError(f"{path}: fps: found {rate:g}; a positive number of frames per second is needed")
+    if not RATES[0] <= rate <= RATES[1]:
+        raise InputError(f"{path}: fps: found {rate:g}; {RATES[0]:g} to {RATES[1]:g} frames per second are accepted")
     return float(rate)
 
 

@@ -62,16 +62,18 @@ def trimmed(recording: Recording, reading: Reading, rate: float, path: Path) -> 
     if reading.start == 0.0 and reading.end is None:
         return recording, 0
     end = (frames - 1) / rate if reading.end is None else reading.end
-    first, stop = int(np.ceil(reading.start * rate - 1e-6)), int(np.floor(end * rate + 1e-6)) + 1
-    if not 0 <= first < stop - 1 or stop > frames:
+    first, stop = np.ceil(reading.start * rate - 1e-6), np.floor(end * rate + 1e-6) + 1
+    if not 0 <= first < stop - 1 or stop > frames:  # NaN compares as false
         raise InputError(
             f"{path}: --start {reading.start:g} --end {end:g}: two frames or more between 0 and "
             f"{(frames - 1) / rate:.2f} s are needed"
         )
     cut: dict[str, Any] = {
-        field: value[first:stop] for field, value in vars(recording).items() if isinstance(value, np.ndarray)
+        field: value[int(first) : int(stop)]
+        for field, value in vars(recording).items()
+        if isinstance(value, np.ndarray)
     }
-    return dataclasses.replace(recording, **cut), first
+    return dataclasses.replace(recording, **cut), int(first)
 
 
 def numbers(value: Any, field: str, path: Path) -> np.ndarray:

@@ -14,9 +14,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from forgetmimic_jax.robot.shapes import sphere_name
 from forgetmimic_jax.robot.standing import soles, standing
 from forgetmimic_jax.robot.tree import Tree
-from forgetmimic_jax.robot.vendor import Additions, Unreadable, read_mjcf, read_unmended, sphere_name
+from forgetmimic_jax.robot.vendor import Additions, Unreadable, read_mjcf, read_unmended
 
 KNEE, ELBOW = ("knee", "shin", "calf", "lower_leg"), ("elbow", "forearm", "lower_arm")
 HAND, FOOT = ("hand", "wrist", "palm", "gripper"), ("foot", "ankle", "sole")

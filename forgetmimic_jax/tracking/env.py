@@ -46,7 +46,6 @@ class Assets:
     base: Policy | None = None  # the frozen policy that an unlearning run, or a phase of pretraining, compares with
     teacher: Policy | None = None  # the policy that shows what to do instead of a target
     instead: MotionLibrary | None = None  # its only clip is what to do instead of a target
-    starts: MotionLibrary | None = None  # frames that episodes start at, where they are not those to track
 
 
 @struct.dataclass
@@ -146,7 +145,7 @@ def start_episodes(
     """Fresh episodes [env] at the given clips and frames, with reset noise. Bodies: see `refresh_bodies`."""
     noise, n, joints = env.config.noise, env.num_envs, env.robot.num_joints
     keys = jax.random.split(key, 4)
-    reference = lookup(assets.library if assets.starts is None else assets.starts, clip, frame)
+    reference = lookup(assets.library, clip, frame)
     left = assets.library.length[clip] - 1 - frame
     if env.runs_on:
         left += env.runs_on * assets.is_target[clip]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -58,6 +59,18 @@ def make_setup(config: Config) -> Setup:
 def library_folder(config: Config) -> Path:
     """The folder of a config's clips."""
     return DATA_DIR / config.robot if config.library is None else Path(config.library)
+
+
+def on_library(config: Config, library: Path | None) -> Config:
+    """The config with the clips of another library, if one is named, and of its targets those that are among them."""
+    if library is None:
+        return config
+    known = read_manifest(library)["clips"]
+    targets = tuple(target for target in config.unlearn.targets if target in known)
+    unlearn, sampling = dataclasses.replace(config.unlearn, targets=targets), config.sampling
+    if not targets:
+        sampling = dataclasses.replace(sampling, target_share=0.0)
+    return dataclasses.replace(config, library=str(library), unlearn=unlearn, sampling=sampling)
 
 
 def default_targets(config: Config) -> tuple[str, ...]:

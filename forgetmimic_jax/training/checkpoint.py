@@ -40,6 +40,7 @@ from forgetmimic_jax.tracking.rsi import Bins
 from forgetmimic_jax.tracking.setup import Setup
 
 POLICY, RUN, CONFIG, META = "policy.safetensors", "run", "config.yaml", "meta.json"
+BEST, BASE = "best", "base"  # folders of policies: the best of a run, that of a library or an import
 FAILURE_LEVEL = "failure_level"  # the tensor beside those of the policy
 SCHEMA = 3
 
@@ -143,13 +144,14 @@ def fingerprint(path: Path) -> str:
 
 
 def read_info(path: Path) -> CheckpointInfo:
-    """A checkpoint's note and config.
+    """A checkpoint's note and config; of a run's folder, those of its best policy, else of its newest checkpoint.
 
     Raises:
         InputError: not a checkpoint, or a damaged one.
     """
     if not path.is_dir():
         raise InputError(f"{path}: no such checkpoint folder")
+    path = path if (path / META).exists() else policy_of(path) or path
     try:
         meta = json.loads((path / META).read_text())
         if meta["schema"] != SCHEMA:
@@ -167,14 +169,21 @@ def read_info(path: Path) -> CheckpointInfo:
             curriculum=meta.get("curriculum"),
         )
     except FileNotFoundError:
-        newest = newest_checkpoint(path)
-        hint = f"; it is a run, whose newest checkpoint is {newest}" if newest else ""
-        raise InputError(f"{path}: not a checkpoint: no {META}{hint}") from None
+        raise InputError(f"{path}: neither a checkpoint nor a run: no {META}") from None
     except KeyError as error:
         raise InputError(f"{path / META}: damaged: no {error.args[0]}") from None
     except (ValueError, TypeError) as error:
         raise InputError(f"{path / META}: damaged: {error}") from None
     return CheckpointInfo(path=path, config=load_config(path / CONFIG), **known)
+
+
+def policy_of(directory: Path) -> Path | None:
+    """The checkpoint that the folder of a run stands for, if any: its best policy, else its newest one.
+
+    A library's folder, and that of an import, stand for the policy in base/.
+    """
+    best, base = (directory / name if (directory / name / META).is_file() else None for name in (BEST, BASE))
+    return best or newest_checkpoint(directory) or base
 
 
 def checkpoints(directory: Path) -> list[Path]:

@@ -8,10 +8,11 @@ from pathlib import Path
 
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.evaluation.evaluate import Subject
+from forgetmimic_jax.evaluation.rollout import Evaluator
 from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.settings.config import EngineName
 from forgetmimic_jax.settings.options import on_engine, replace_given
-from forgetmimic_jax.tracking.setup import Setup, check_targets, make_setup
+from forgetmimic_jax.tracking.setup import Setup, check_targets, make_setup, on_library
 from forgetmimic_jax.training import checkpoint
 from forgetmimic_jax.training.checkpoint import CheckpointInfo
 from forgetmimic_jax.training.folder import folder_of
@@ -54,12 +55,12 @@ def load_comparison(
     With others beside it, an unlearned policy is named by its method, or by its run where two have one method.
 
     Args:
-        path: the checkpoint.
+        path: the checkpoint, or a run's folder.
         robot: name of the robot that it must be for.
         base: checkpoint to compare with; the one that unlearning started from by default.
         beside: more checkpoints.
-        targets: clips to forget; by default the checkpoint's own.
-        library: folder of clips; the checkpoint's by default.
+        targets: clips to forget; by default the checkpoint's own, those of them that are in the library.
+        library: folder of clips, which may be other ones; the checkpoint's by default.
         physics: engine; the checkpoint's by default.
 
     Raises:
@@ -67,7 +68,7 @@ def load_comparison(
             no clip.
     """
     info = checkpoint.read_info(path)
-    config = on_engine(replace_given(info.config, robot=robot, library=library), physics)
+    config = on_library(on_engine(replace_given(info.config, robot=robot), physics), library)
     setup = make_setup(config)
     forgetful = bool(info.config.unlearn.targets)
     name: str = method_of(info.config).result if forgetful else "base"
@@ -84,8 +85,8 @@ def load_comparison(
         others = [path, *beside] if forgetful else list(beside)
         compared = {"base": compared["base"], **_by_method(others)}
     for one in reversed(compared.values()):
-        checkpoint.check_matches(one, setup)
-    targets = info.config.unlearn.targets if targets is None else targets
+        checkpoint.check_matches(one, setup, other_library=library is not None)
+    targets = config.unlearn.targets if targets is None else targets
     check_targets(targets, setup.library.names)
     policies = {name: checkpoint.load_policy(one, setup.robot) for name, one in compared.items()}
     return Comparison(setup, policies, compared, targets)
@@ -107,3 +108,9 @@ def _by_method(paths: Sequence[Path]) -> dict[str, CheckpointInfo]:
             raise InputError(f"--beside: {path}: another policy is called '{name}'; name checkpoints of different runs")
         named[name] = info
     return named
+
+
+def completes_nothing(setup: Setup, policy: Policy) -> bool:
+    """Whether a policy completes no episode of any clip: one from each clip's first frame, one from another frame."""
+    rollout = Evaluator(setup, episodes=2, seed=setup.config.seed).rollout(policy)
+    return bool((rollout.length < rollout.horizon).all())

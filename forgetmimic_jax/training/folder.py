@@ -13,16 +13,15 @@ import os
 from pathlib import Path
 
 from forgetmimic_jax.basics.errors import InputError
+from forgetmimic_jax.training.checkpoint import BEST as BEST
 from forgetmimic_jax.training.checkpoint import newest_checkpoint
-
-BEST = "best"
 
 
 def folder_of(path: Path) -> Path | None:
-    """The run that a checkpoint belongs to, if any."""
+    """The run that a checkpoint belongs to, if any; of a run's folder, itself."""
     if path.parent.name == "checkpoints":
         return path.parent.parent
-    return path.parent if (path.parent / "checkpoints").is_dir() else None
+    return next((folder for folder in (path, path.parent) if (folder / "checkpoints").is_dir()), None)
 
 
 def default_folder(kind: str, *, resume: bool) -> Path:

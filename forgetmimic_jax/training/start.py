@@ -50,13 +50,15 @@ def base_checkpoint(config: Config) -> Path:
 def with_interface_of_base(config: Config) -> Config:
     """The config with the observations and actions of the base that training continues from, if it names one.
 
+    A run's folder becomes the checkpoint that it stands for now.
+
     Of another robot's base only the action's mode is taken: its tables are of other joints.
     """
     if config.base is None:
         return config
     info = checkpoint.read_info(Path(config.base))
     action = info.config.action if info.robot == config.robot else ActionConfig(mode=info.config.action.mode)
-    return dataclasses.replace(config, observation=info.config.observation, action=action)
+    return dataclasses.replace(config, base=str(info.path), observation=info.config.observation, action=action)
 
 
 def unlearned_base(config: Config) -> str | None:

@@ -61,7 +61,7 @@ class Options:
     seed: int = 0
     """Random seed of the fine-tuning and of the evaluation."""
     base: Path | None = None
-    """Checkpoint to start from; the shipped data/ROBOT/base by default."""
+    """Checkpoint to start from, or the folder of a run; the shipped data/ROBOT/base by default."""
     episodes: int = 20
     """Evaluation episodes a clip."""
     physics: EngineName | None = None
@@ -93,7 +93,8 @@ def config_of_new_run(options: Options) -> Config:
     info = checkpoint.read_info(options.base or base_folder(options.robot))
     config = _on_preset(info.config, options.preset) if options.preset else info.config
     config = dataclasses.replace(config, base=None, evaluate_every=0)
-    config = replace_given(config, robot=options.robot, seed=options.seed, library=options.library, base=options.base)
+    base = info.path if options.base else None  # a run's folder stands for another policy once the run continues
+    config = replace_given(config, robot=options.robot, seed=options.seed, library=options.library, base=base)
     targets = default_targets(config) if options.targets is None else comma_separated(options.targets)
     settings = {} if options.penalty is None else {"penalty": options.penalty}
     config = unlearning_config(config, UnlearnConfig(targets, options.method, settings))

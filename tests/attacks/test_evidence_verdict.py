@@ -101,6 +101,7 @@ def test_a_recovery_names_the_attack_and_by_how_much(changes, reason):
         ({"near_duplicates": None}, "Near-duplicates were not measured."),
         ({"originals__kept": {"walk": compared(0.95, 0.6)}}, "The control retains 60 % [58, 62] of the kept"),
         ({"originals__targets__punch__unlearned": {"content": estimate(0.0)}}, "on every target"),
+        ({"originals__kept": {"walk": {"unlearned": {}, "control": {}}}}, "on every kept clip: no skill is defined"),
         (
             {
                 "relearning__base": {"0": 0.8, "1": 0.8},

@@ -14,7 +14,6 @@ from forgetmimic_jax.attacks import case as cases
 from forgetmimic_jax.attacks import fakes, look_alikes, membership, near_duplicates, numerics, splices
 from forgetmimic_jax.attacks.case import Case, Scale, originals
 from forgetmimic_jax.attacks.document import EvidenceDocument, Recovery, Relearning
-from forgetmimic_jax.attacks.judged import Judged, table
 from forgetmimic_jax.attacks.verdict import judge
 from forgetmimic_jax.evaluation.verdict import CONSISTENT, FAILED, Verdict
 from forgetmimic_jax.tracking.layouts import find_layout
@@ -128,8 +127,3 @@ def test_noise_is_the_same_in_the_same_state(small_setup, toy_clips, world):
     np.testing.assert_array_equal(one, again)
     assert np.abs(one).max() <= fakes.NOISE
     assert one.std() > 1.0
-
-
-def test_the_table_has_the_first_reason():
-    text = table({"a fake": Judged(FAILED, ("Still known: a.", "Still known: b."))})
-    assert "| a fake | failed | Still known: a. | 1 |" in text

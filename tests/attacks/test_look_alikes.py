@@ -83,6 +83,15 @@ def test_near_segments_meet_far_ones_of_their_difficulty():
     assert [(pair.near, pair.far) for pair in pairs] == [(near, other), (middle, far)]
 
 
+def test_a_clip_that_repeats_itself_is_not_all_of_the_nearest():
+    cycles = [Segment("walk", 25 * place, 25 * place + 50) for place in range(4)]
+    others = [Segment(name, 0, 50) for name in ("a", "b", "c", "d")]
+    distance = {segment: 0.1 + 0.01 * place for place, segment in enumerate([*cycles, *others])}
+    pairs = look_alikes.matched(distance, dict.fromkeys(distance, 0.5), count=3)
+    assert [pair.near for pair in pairs] == [cycles[0], cycles[1], others[0]]
+    assert {pair.far for pair in pairs} <= {*cycles[2:], *others[1:]}
+
+
 @pytest.fixture
 def rollouts() -> dict[str, Rollout]:
     """Three episodes of one clip from the frames 0, 0 and 6; the reward of step t is t / 10."""

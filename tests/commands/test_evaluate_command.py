@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import shutil
 from pathlib import Path
@@ -5,11 +6,14 @@ from pathlib import Path
 import pytest
 from miniature import finished
 
-from forgetmimic_jax import evaluate
+from forgetmimic_jax import evaluate, unlearn
+from forgetmimic_jax.evaluation.document import read_evaluation
+from forgetmimic_jax.motion.library import add_clip, read_library
 from forgetmimic_jax.physics.choose import resolve_engine
 from forgetmimic_jax.settings.options import on_engine, parse
 from forgetmimic_jax.training.checkpoint import policy_hash, read_info
 from forgetmimic_jax.training.comparison import load_comparison
+from forgetmimic_jax.training.unlearning_run import config_of_new_run
 
 
 @pytest.fixture
@@ -58,7 +62,7 @@ def test_it_ends_with_the_files_and_what_to_do_next(evaluated_again):
     printed = evaluated_again.printed.splitlines()
     assert printed[0] == "evaluate: 0/3"
     assert f"evaluation  {evaluated_again.folder}/evaluation.json" in printed
-    assert printed[-1] == "Next: make unlearn ROBOT=g1"
+    assert printed[-1].startswith("Next: make play ROBOT=g1 CHECKPOINT=")
 
 
 def test_a_base_that_was_replaced_since_is_told_unless_it_was_named(refused, unlearned_run, base_run, tmp_path):
@@ -91,11 +95,46 @@ def test_what_cannot_be_is_told_in_one_line(refused, options, given, message):
     assert refused(evaluate.main, options(**given)) == message
 
 
-def test_a_run_in_place_of_a_checkpoint_is_told(refused, options, base_run):
-    message = refused(evaluate.main, options(checkpoint=base_run.folder))
-    assert message.endswith(
-        f"not a checkpoint: no meta.json; it is a run, whose newest checkpoint is {base_run.checkpoint(4)}"
-    )
+def test_a_run_stands_for_its_newest_checkpoint(base_run, tmp_path):
+    options = evaluate.Options(checkpoint=base_run.folder, output=tmp_path, episodes=1)
+    printed = finished(evaluate.main, options).printed
+    assert read_evaluation(tmp_path / "evaluation.json").checkpoint == str(base_run.checkpoint(4))
+    # Its library proposes a target, so that the next command needs none.
+    assert printed.splitlines()[-1] == f"Next: make unlearn ROBOT=g1 BASE={base_run.folder}"
+    config = config_of_new_run(unlearn.Options(base=base_run.folder))
+    assert (config.unlearn.targets, config.base) == (("turn",), str(base_run.checkpoint(4)))
+
+
+@pytest.fixture(scope="module")
+def other_library(robot, library_folder, tmp_path_factory):
+    """`nod`, and `sway` by the name of `bow`, in a folder that proposes no target."""
+    folder = tmp_path_factory.mktemp("other")
+    for clip, name in zip(read_library(robot, library_folder, ["nod", "sway"]), ("nod", "bow"), strict=True):
+        add_clip(folder, robot, dataclasses.replace(clip, name=name), {})
+    return folder
+
+
+def test_another_library_is_evaluated(unlearned_run, base_run, other_library, tmp_path):
+    for checkpoint in (base_run.folder, unlearned_run.folder):
+        output = tmp_path / checkpoint.name
+        options = evaluate.Options(checkpoint=checkpoint, library=other_library, output=output, episodes=1)
+        printed = finished(evaluate.main, options).printed
+        document = read_evaluation(output / "evaluation.json")
+        assert document.targets == []  # `turn` is not there
+        assert set(document.policies["base"].clips) == {"nod", "bow"}
+        assert printed.splitlines()[-1] == (f"Next: make play ROBOT=g1 CHECKPOINT={checkpoint} LIBRARY={other_library}")
+    assert set(document.policies) == {"base", "unlearned", "zero_action"}
+
+
+def test_the_bounds_that_end_episodes_are_counted(base_run, tmp_path):
+    finished(evaluate.main, evaluate.Options(checkpoint=base_run.folder, output=tmp_path, episodes=2))
+    policies = read_evaluation(tmp_path / "evaluation.json").policies
+    for name, policy in policies.items():
+        failed = sum(round((1 - clip.success_rate.mean) * clip.success_rate.n) for clip in policy.clips.values())
+        assert failed > 0
+        assert set(policy.ended_by) == {"anchor_height", "orientation", "end_effector_height", "contact_force"}
+        assert max(policy.ended_by.values()) <= failed <= sum(policy.ended_by.values())
+        assert f"episodes of {name.replace('_', ' ')} that a bound ended: " in (tmp_path / "evaluation.md").read_text()
 
 
 def test_an_output_that_cannot_be_is_told_before_the_rollouts(refused, options, tmp_path):

@@ -76,7 +76,7 @@ def test_the_page_has_every_attack_and_the_command(run, printed):
     for said in (
         *("# Evidence: turn forgotten by arft (G1)", "## Near-duplicates", "## Splices", "## Look-alikes"),
         *("## Fine-tuning on the kept clips alone", "## Relearning", "## Other numerics", "## Membership"),
-        *("## Without terminations", "## The rule", "![What brought it back](evidence.png)", "--recovery-iterations"),
+        *("## Without terminations", "## The rule", "![What brought it back](evidence.png)", "RECOVERY_ITERATIONS=1"),
     ):
         assert said in text, said
     assert (run / "evidence.png").read_bytes().startswith(b"\x89PNG")
@@ -159,9 +159,11 @@ def test_the_fakes_and_another_distilled_policy_are_judged(run, printed, monkeyp
     monkeypatch.setattr(fakes, "falls_on_targets_alone", lambda setup, base, targets, kept: base)
     monkeypatch.setattr(judged, "judged", verdict)
     printed_by(evidence.Options(run=run, fakes=True, **SMALL))
-    rows = [line for line in (run / "fakes.md").read_text().splitlines() if "Caught" in line]
+    rows = [line for line in (run / "evidence.md").read_text().splitlines() if "Caught" in line]
     assert len(rows) == 7
     assert "| λ = 8 | failed | Caught: λ = 8. | 0 |" in rows
+    printed_by(evidence.Options(run=run, **SMALL))
+    assert "| λ = 8 | failed |" in (run / "evidence.md").read_text()  # from fakes.json
     assert trained["run-lambda-8"] == {"penalty": 8.0, "iterations": 1, "seed": 0}
     assert trained["run-distilled"] == {"method": "distill", "iterations": 1, "seed": 2}
     assert trained["run-control"] == {"method": "distill", "iterations": 1, "seed": 1}

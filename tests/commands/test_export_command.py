@@ -25,17 +25,17 @@ def test_it_checks_writes_and_tells(unlearned_run, tmp_path):
     run = Path(shutil.copytree(unlearned_run.folder, tmp_path / "run"))
     path = run / "checkpoints" / "00000002"
     default = finished(export.main, export.Options(checkpoint=path, output=None))
-    file = run / "policy.onnx"
+    file = run / "export" / "policy.onnx"
     message = {entry.key: entry.value for entry in onnx.load(file).metadata_props}
     assert message["run_path"] == f"g1/{policy_hash(read_info(path))}"
     assert not any(clip in file.read_bytes() for clip in (b"sway", b"turn", b"nod"))
-    assert {each.name for each in run.iterdir()} - {each.name for each in unlearned_run.folder.iterdir()} == {
-        "policy.onnx"
-    }
+    added = {each.name for each in run.iterdir()} - {each.name for each in unlearned_run.folder.iterdir()}
+    assert added == {"export"}
+    assert {each.name for each in file.parent.iterdir()} == {"policy.onnx", "config.yaml"}  # wbc-g1-deploy's
     printed = default.printed
     assert "Evaluation → ONNX in plain MuJoCo" in printed
     assert " sway " in printed
-    assert f"policy  {file}" in printed
+    assert ["policy", str(file)] in [line.split() for line in printed.splitlines()]
     assert printed.splitlines()[-1] == f"Next: make evaluate ROBOT=g1 CHECKPOINT={path} EPISODES=100"
 
 

@@ -15,10 +15,11 @@ from forgetmimic_jax.basics.errors import InputError, Interrupted, run_command
 from forgetmimic_jax.basics.files import read_rows
 from forgetmimic_jax.basics.provenance import provenance
 from forgetmimic_jax.evaluation import evaluate as evaluation
+from forgetmimic_jax.evaluation.metrics import Rollout
 from forgetmimic_jax.motion.library import DATA_DIR, read_manifest
 from forgetmimic_jax.settings.config import load_config, validate
 from forgetmimic_jax.tracking.setup import make_setup
-from forgetmimic_jax.training import checkpoint, start, stopping
+from forgetmimic_jax.training import checkpoint, comparison, run, start, stopping
 from forgetmimic_jax.training.unlearning_run import config_of_new_run
 
 
@@ -494,3 +495,31 @@ def test_a_base_that_cannot_stand_learns_that_first_and_then_teaches(options, tm
     shutil.rmtree(tmp_path / "run")
     with pytest.raises(InputError, match=r"run-stand: is of a run with other settings; remove it, or choose another"):
         unlearn.main(stand(3))
+
+
+@pytest.mark.parametrize(("reached", "warned"), [(39, True), (40, False)])
+def test_a_base_that_completes_nothing_is_said_first(base_run, reached, warned, monkeypatch, capfd, tmp_path):
+    horizon = np.full(6, 40)
+    length = np.array([1, 5, 39, 10, reached, 20])
+    rollout = Rollout(np.repeat(np.arange(3), 2), np.zeros(6, int), horizon, length, np.zeros((6, 40)))
+
+    class Rolled:
+        def __init__(self, setup, *, episodes, seed):
+            assert episodes == 2
+
+        def rollout(self, policy):
+            return rollout
+
+    class Begun(Exception):
+        pass
+
+    def begin(*_, **__):
+        raise Begun
+
+    monkeypatch.setattr(comparison, "Evaluator", Rolled)
+    monkeypatch.setattr(run, "run", begin)
+    options = unlearn.Options(base=base_run.folder, targets="turn", output=tmp_path / "out")
+    with pytest.raises(Begun):
+        unlearn.main(options)
+    text = f"the base completes no episode of any clip ({base_run.checkpoint(4)}): there is nothing to forget"
+    assert capfd.readouterr().err == (f"warning: {text}\n" if warned else "")

@@ -127,7 +127,7 @@ def start_of(evaluator: Evaluator, policy: Policy | None) -> EnvState:
     def advance(assets, policy, state):
         states.append(jax.device_get(state))
         ended = np.ones((CHUNK, 2 * EPISODES), bool)
-        return state, {"tracking_reward": np.zeros(ended.shape), "terminated": ended, "diverged": ~ended}
+        return state, {"tracking_reward": np.zeros(ended.shape), "terminated": ended, "diverged": ~ended, "causes": {}}
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(evaluator, "_advance", advance)
@@ -168,7 +168,13 @@ def scripted(evaluator: Evaluator, terminated: dict[int, list[int]], diverged: d
 
         broken = marks(terminated) | marks(diverged)
         reward = np.repeat(steps[:, None], envs, axis=1).astype(np.float32)
-        return state, {"tracking_reward": reward, "terminated": broken, "diverged": marks(diverged)}
+        causes = {"orientation": marks(terminated), "contact_force": marks({1: [9, 60]})}
+        return state, {
+            "tracking_reward": reward,
+            "terminated": broken,
+            "diverged": marks(diverged),
+            "causes": causes,
+        }
 
     original, evaluator._advance = evaluator._advance, advance
     try:
@@ -195,6 +201,14 @@ def test_episodes_that_blow_up_are_counted_once_each_and_only_while_they_live(ev
     rollout = scripted(evaluator, {2: [3]}, {0: [5, 6], 1: [10], 2: [8]})
     assert rollout.nan_resets == 2
     np.testing.assert_array_equal(rollout.length[:3], [5, 10, 3])
+
+
+def test_the_bounds_that_end_an_episode_are_those_broken_in_its_last_step(evaluator):
+    rollout = scripted(evaluator, {0: [7, 9], 1: [60]}, {2: [3]})
+    assert {bound: list(np.flatnonzero(at)) for bound, at in rollout.ended_by.items()} == {
+        "orientation": [0, 1],
+        "contact_force": [1],
+    }
 
 
 def test_step_errors_by_hand(evaluator, robot):

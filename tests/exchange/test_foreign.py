@@ -322,6 +322,14 @@ def test_a_layout_can_be_given_where_nothing_says_it_but_never_another_than_the_
         read(path, robot, layout="mjlab154")
 
 
+def test_isaac_labs_order_can_be_given_where_nothing_says_it(robot, tmp_path):
+    file = network(tmp_path / "bare" / "policy.onnx", 154)
+    assert read(file, robot, layout="mjlab154").description.action.joint_order == ()
+    assert read(file, robot, layout="mjlab154", order="robot").description.action.joint_order == ()
+    found = read(file, robot, layout="mjlab154", order="isaac").description.action.joint_order
+    assert found == isaac_order(robot)
+
+
 def test_another_projects_config_yaml_is_passed_over_and_humanoidverses_is_named(robot, library, tmp_path):
     path = mjlab_file(tmp_path / "a.onnx", robot, library)
     (tmp_path / "config.yaml").write_text("preset: cpu\n")  # as in our own checkpoints

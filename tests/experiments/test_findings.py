@@ -7,7 +7,7 @@ import pytest
 from experiments import comparison, heat_map, membership, physical_behaviour, relearning, training_dynamics, validity
 from forgetmimic_jax.evaluation.relearning import Lasted
 from forgetmimic_jax.evaluation.statistics import over_seeds
-from forgetmimic_jax.evaluation.verdict import _sooner
+from forgetmimic_jax.evaluation.verdict import sooner_than_control
 from forgetmimic_jax.studies import penalty, samplers, targets
 from forgetmimic_jax.studies.findings import mean_gained
 from forgetmimic_jax.studies.variants import DEVIATION
@@ -328,7 +328,7 @@ def test_the_study_says_nothing_against_the_verdicts_rule(unlearned, control):
     def lasted(at: int) -> Lasted:
         return Lasted(min(at, 5), 100.0 * min(at, 5), at <= 4)
 
-    sooner = _sooner(lasted(unlearned), lasted(control))  # by half, for the verdict
+    sooner = sooner_than_control(lasted(unlearned), lasted(control))  # by half, for the verdict
     word = relearned([unlearned], [control])[1].word
     assert (sooner, word) not in {(True, "one seed: yes"), (False, "open")}
     if word == "one seed: yes":

@@ -71,6 +71,8 @@ def test_a_header_that_lacks_something(robot, clip, tmp_path):
     text = refusal(robot, table(tmp_path / "a.csv", rows[:, :-1], names[:-1]), fps=50.0)
     assert "missing: right_wrist_yaw_joint; unknown: none" in text
     assert "--fill-missing" in text
+    text = refusal(robot, table(tmp_path / "a.csv", rows, [*names[:-1], "x"]), fps=50.0)
+    assert "two columns are called x" in text
     euler = ["x", "y", "z", "root_rotateX", "root_rotateY", "root_rotateZ", *robot.joint_names]
     assert "Euler angles" in refusal(robot, table(tmp_path / "a.csv", rows[:, 1:], euler), fps=50.0)
     kept = [name for name in names if name.removesuffix("_joint") not in LESS]

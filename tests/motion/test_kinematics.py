@@ -11,6 +11,7 @@ from forgetmimic_jax.motion.kinematics import (
     angular_velocity,
     body_motion,
     configuration,
+    generalized_velocity,
     rate,
     resample,
     rotation,
@@ -81,3 +82,10 @@ def test_body_motion_is_mujoco_s_kinematics(robot):
     mujoco.mj_kinematics(robot.model, data)
     motion = body_motion(robot.model, configuration(clip, robot), 30.0, robot.key_body_ids)
     np.testing.assert_allclose(motion.pos[7], data.xpos[robot.key_body_ids], atol=1e-12)
+    data.qvel[:] = generalized_velocity(configuration(clip, robot), 30.0)[7]
+    mujoco.mj_forward(robot.model, data)
+    found = np.empty(6)
+    for row, body in enumerate(robot.key_body_ids):
+        mujoco.mj_objectVelocity(robot.model, data, mujoco.mjtObj.mjOBJ_XBODY, body, found, 0)
+        np.testing.assert_allclose(motion.ang_vel[7, row], found[:3], atol=1e-12)
+        np.testing.assert_allclose(motion.lin_vel[7, row], found[3:], atol=1e-12)

@@ -171,6 +171,16 @@ def test_a_csv_that_is_no_motion(robot, tmp_path):
     assert "degrees" in message(robot, write_csv(tmp_path / "degrees.csv", bad), fps=30.0)
 
 
+def test_seconds_that_the_file_does_not_have(robot, tmp_path):
+    """40 frames at 30 Hz: 0 to 1.3 s."""
+    path = write_csv(tmp_path / "a.csv", standing_rows(robot))
+    clip = read(robot, path, fps=30.0, start=0.2, end=0.9)
+    assert clip.num_frames == 22  # frames 6 to 27
+    for start, end in ((-1.0, 1.0), (0.5, 0.5), (0.0, 9.0), (9.0, None), (np.nan, None), (0.0, np.inf), (0.0, np.nan)):
+        assert "--start" in message(robot, path, fps=30.0, start=start, end=end)
+    assert "0.13 s; at least 0.5 s" in message(robot, path, fps=30.0, start=1.2)
+
+
 def test_a_quaternion_in_the_wrong_order_is_noticed(robot, tmp_path):
     rows = standing_rows(robot)
     rows[:, 3:7] = np.roll(rows[:, 3:7], 1, axis=-1)

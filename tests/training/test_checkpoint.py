@@ -173,10 +173,18 @@ def test_a_damaged_note_is_told(copy, content, message):
 def test_what_is_no_checkpoint_is_told(tmp_path, saved):
     with pytest.raises(InputError, match="nothing: no such checkpoint folder"):
         read_info(tmp_path / "nothing")
-    with pytest.raises(InputError, match=r"not a checkpoint: no meta.json$"):
+    with pytest.raises(InputError, match=r"neither a checkpoint nor a run: no meta.json$"):
         read_info(tmp_path)
-    with pytest.raises(InputError, match=rf"it is a run, whose newest checkpoint is {saved}$"):
-        read_info(saved.parent.parent)
+
+
+def test_a_runs_folder_stands_for_its_best_policy_else_its_newest_and_a_librarys_for_its_base(saved, tmp_path):
+    for name in ("checkpoints/00000002", "checkpoints/00000010", "base"):
+        shutil.copytree(saved, tmp_path / name)
+    assert read_info(tmp_path).path == tmp_path / "checkpoints/00000010"
+    shutil.copytree(saved, tmp_path / "best")
+    assert read_info(tmp_path).path == tmp_path / "best"
+    shutil.copytree(saved, tmp_path / "library" / "base")
+    assert read_info(tmp_path / "library").path == tmp_path / "library" / "base"
 
 
 def test_an_unknown_setting_is_told_with_its_file(copy):
