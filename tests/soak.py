@@ -19,7 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,7 @@ from forgetmimic_jax.training.checkpoint import META, POLICY, newest_checkpoint
 ROOT = Path(__file__).resolve().parents[1]
 LENGTH = 40  # iterations, with a checkpoint after each second one
 AT_START = 0.2  # share of the kills that come at any moment; the others come after the first file was written
-TMPFS = 2**28  # bytes, more than any run here writes
+PAGE, TMPFS = 2**12, 2**28  # bytes, the least that a disk has, and more than any run here writes
 
 
 @dataclass(frozen=True)
@@ -114,8 +114,8 @@ def half_written(folder: Path) -> list[str]:
     return faults
 
 
-def scenes(folder: Path) -> dict[str, Scene]:
-    """The commands on two invented clips and a small base, which are made here."""
+def scenes(folder: Path, wanted: Collection[str]) -> dict[str, Scene]:
+    """The wanted commands, on two invented clips and a small base, which are made here."""
     robot, library = load_robot("g1"), folder / "library"
     library.mkdir()
     entries = {}
@@ -129,18 +129,20 @@ def scenes(folder: Path) -> dict[str, Scene]:
     length = ("--iterations", str(LENGTH))
     train = ("train", "--library", str(library), *length, "--set", *TINY)
     base = folder / "base"
-    said, code = finish(Scene(train, "--output", True, trained).start(base))
-    assert code == 0, said
+    if {"unlearn", "evaluate"} & set(wanted):
+        said, code = finish(Scene(train, "--output", True, trained).start(base))
+        assert code == 0, said
     checkpoint = str(newest_checkpoint(base))
     forget = ("unlearn", "--base", checkpoint, "--targets", "turn", "--episodes", "2", *length)
     measure = ("evaluate", "--checkpoint", checkpoint, "--episodes", "2")
     convert = ("motions", "import", str(folder / "turn.csv"), "--fps", "50", "--force")
-    return {
+    every = {
         "train": Scene(train, "--output", True, trained),
         "unlearn": Scene(forget, "--output", True, trained),
         "evaluate": Scene(measure, "--output", False, evaluated),
         "import": Scene(convert, "--library", False, imported),
     }
+    return {name: scene for name, scene in every.items() if name in wanted}
 
 
 def finish(process: subprocess.Popen) -> tuple[str, int]:
@@ -208,7 +210,7 @@ def fill(scene: Scene, folder: Path, times: int, rng: random.Random) -> list[str
     faults, disk = [], folder / "disk"
     disk.mkdir()
     for _ in range(times):
-        size = rng.randrange(2**14, needed)
+        size = rng.randrange(PAGE, needed)
         subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "none", str(disk)], check=True)
         try:
             output = disk / "output"
@@ -256,26 +258,21 @@ def main() -> int:
     if "full" in parts and "SOAK_NAMESPACE" not in os.environ:  # to mount disks; its own, nobody else sees them
         os.execvpe("unshare", ["unshare", "-rm", sys.executable, *sys.argv], os.environ | {"SOAK_NAMESPACE": "1"})
     with tempfile.TemporaryDirectory() as name:
-        commands = scenes(Path(name)) if {"kill", "full"} & set(parts) else {}
+        wanted = (given.only or ("train", "unlearn", "evaluate", "import")) if {"kill", "full"} & set(parts) else ()
+        commands = scenes(Path(name), wanted)
         for part, disturb in (("kill", kill), ("full", fill)):
-            for command, scene in commands.items() if part in parts else ():
-                if not given.only or command in given.only:
+            if part in parts:
+                for command, scene in commands.items():
                     folder = Path(name) / f"{part}-{command}"
                     folder.mkdir()
-                    found[f"{part} {command}"] = disturb(scene, folder, given.times, rng)
-                    print(
-                        f"{part} {command}: {given.times} times, {len(found[f'{part} {command}'])} faults", flush=True
-                    )
+                    found[f"{part} {command}"] = faults = disturb(scene, folder, given.times, rng)
+                    print(f"{part} {command}: {given.times} times, {len(faults)} faults", flush=True)
     if "inputs" in parts:
         given.keep.mkdir(parents=True, exist_ok=True)
-        families = [family for family in (*FAMILIES, "flags", "code") if not given.only or family in given.only]
-        mutated = inputs(families, given.times, given.keep)
-        print(
-            "\n".join(
-                f"inputs {family}: {given.times} times, {len(faults)} faults" for family, faults in mutated.items()
-            )
-        )
-        found |= mutated
+        for family in (*FAMILIES, "flags", "code"):
+            if not given.only or family in given.only:
+                found[f"inputs {family}"] = faults = inputs(family, given.times, given.keep)
+                print(f"inputs {family}: {given.times} times, {len(faults)} faults", flush=True)
     faults = [f"{where}: {fault}" for where, some in found.items() for fault in some]
     print("\n".join([*faults, f"{len(faults)} faults"]))
     return 1 if faults else 0
