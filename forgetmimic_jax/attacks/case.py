@@ -24,7 +24,7 @@ class Scale:
 
     episodes: int = 20  # of a clip
     target_episodes: int = 50  # of a target, on which most comparisons rest
-    variant_episodes: int = 10  # of a near-duplicate of a target, and of a splice
+    variant_episodes: int = 20  # of a near-duplicate of a target, and of a splice
     kept_variant_episodes: int = 4  # of a near-duplicate of a kept clip, of which there are many
     hosts: int = 2  # kept clips with which each target is spliced
     recovery_iterations: int = 100

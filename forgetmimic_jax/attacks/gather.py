@@ -39,7 +39,7 @@ from forgetmimic_jax.basics.provenance import made_here, provenance
 from forgetmimic_jax.evaluation.document import UnboundedResult
 
 FULL = Scale(
-    episodes=40, target_episodes=100, variant_episodes=20, kept_variant_episodes=8, hosts=4, relearning_iterations=300,
+    episodes=40, target_episodes=100, variant_episodes=40, kept_variant_episodes=8, hosts=4, relearning_iterations=300,
     held_out_iterations=100,
     seeds=3,
 )  # fmt: skip
