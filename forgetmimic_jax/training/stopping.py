@@ -28,7 +28,7 @@ from forgetmimic_jax.training.course import Plain, Position
 
 AT_BASELINE = 0.1  # skill up to which the targets are at the zero-action baseline
 IN_A_ROW = 2
-SETTLE = 20  # iterations
+SETTLE = 60  # iterations
 EPISODES = 10  # a target clip
 
 

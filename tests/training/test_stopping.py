@@ -68,14 +68,14 @@ def through(course: Stopping, assets, start: int, end: int) -> tuple[list[float]
     return shares, position.iteration
 
 
-def test_the_step_size_falls_to_nothing_over_twenty_iterations_and_the_run_ends(course):
+def test_the_step_size_falls_to_nothing_over_sixty_iterations_and_the_run_ends(course):
     shares, end = through(course(), course.assets, 0, 100)
-    assert end == 35  # 15 and 20
+    assert end == 75  # 15 and 60
     assert course.looks == [5, 10, 15]  # at the baseline at 10 and 15
-    assert shares == pytest.approx([1.0] * 15 + [1.0 - i / 20 for i in range(20)])
+    assert shares == pytest.approx([1.0] * 15 + [1.0 - i / 60 for i in range(60)])
 
 
-@pytest.mark.parametrize("stopped", [7, 10, 12, 15, 22, 35])
+@pytest.mark.parametrize("stopped", [7, 10, 12, 15, 22, 75])
 def test_a_run_that_was_stopped_ends_where_it_would_have(course, stopped):
     whole, end = through(course(), course.assets, 0, 100)
     first = course()
