@@ -57,7 +57,7 @@ def make_control(run, document, tmp_path) -> Callable[..., Path]:
         folder = tmp_path / "control"
         folder.mkdir(exist_ok=True)
         settings = {"unlearn.method": "distill", "sampling.clips": "kept", "sampling.target_share": 0.0}
-        settings |= {"unlearn.settings": {}}  # the penalty is arft's
+        settings |= {"unlearn.settings": {}, "unlearn.stop_every": 0}  # the penalty and the stop rule are arft's
         save_config(changed(load_config(run / "config.yaml"), settings | (config or {})), folder / "config.yaml")
         policy = skilled(document["policies"]["unlearned"], target=0.1, kept=kept)
         result = {"distill": "unlearned", "retrain": "retrained"}.get((config or {}).get("unlearn.method"), "unlearned")
