@@ -170,7 +170,8 @@ class _Chain:
             node = self._producers[name]
             given = {each: self._constant(each) for each in node.input if each}
             if all(value is not None for value in given.values()):
-                self._constants |= dict(zip(node.output, ReferenceEvaluator(node).run(None, given), strict=True))
+                with np.errstate(all="ignore"):  # what is not finite is refused by its name, later
+                    self._constants |= dict(zip(node.output, ReferenceEvaluator(node).run(None, given), strict=True))
         return self._constants.get(name)
 
 

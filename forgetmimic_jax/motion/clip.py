@@ -12,7 +12,8 @@ import numpy as np
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.basics.files import write_atomically
 
-FIELDS = ("fps", "joint_names", "root_pos", "root_quat", "joint_pos")
+DIMENSIONS = {"fps": 0, "joint_names": 1, "root_pos": 2, "root_quat": 2, "joint_pos": 2}  # of each field's array
+FIELDS = tuple(DIMENSIONS)
 # Coarser than the last bits that differ between machines' linear algebra, so that a clip regenerates bit for bit;
 # 1e-5 rad or m is far below what a motor or a foot can tell.
 DECIMALS = 5
@@ -115,9 +116,16 @@ def read_clip(path: Path) -> Clip:
             missing = [field for field in FIELDS if field not in archive]
             if missing:
                 raise InputError(f"{path}: missing {', '.join(missing)}; a clip holds {', '.join(FIELDS)}")
-            content = {field: archive[field] for field in FIELDS}
+            content = {field: np.asarray(archive[field]) for field in FIELDS}
     except (ValueError, zipfile.BadZipFile, EOFError) as error:
         raise InputError(f"{path}: not a clip NPZ ({error})") from error
+    for field, value in content.items():
+        accepted = "U" if field == "joint_names" else "iuf"
+        if value.dtype.kind not in accepted or value.ndim != DIMENSIONS[field]:
+            raise InputError(
+                f"{path}: {field}: found {value.dtype.name} of shape {list(value.shape)}; "
+                f"{'text' if accepted == 'U' else 'numbers'} in {DIMENSIONS[field]} dimensions are needed"
+            )
     return validated(
         Clip(
             name=path.stem,

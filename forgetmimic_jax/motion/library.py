@@ -200,6 +200,8 @@ def add_clip(path: Path, robot: Robot, clip: Clip, facts: Mapping[str, Any], *, 
     _check_joints(clip, robot)
     manifest = manifest_for(path, robot, clip.name, clip.fps, overwrite=overwrite)
     path.mkdir(parents=True, exist_ok=True)
+    if not (path / MANIFEST).exists():
+        write_manifest(path, manifest)  # first, so that what a crash leaves is a library too
     file = path / f"{clip.name}.npz"
     write_clip(clip, file)
     measures = {"frames": clip.num_frames, "seconds": clip.seconds}

@@ -1,7 +1,10 @@
 """Clip files, manifests and the padded arrays."""
 
 import dataclasses
+import errno
 import json
+import re
+import zipfile
 
 import jax
 import numpy as np
@@ -186,3 +189,41 @@ def test_a_clip_far_from_the_ground_is_refused(robot, clip):
     check_touches(standing, lowest)
     with pytest.raises(InputError, match="never touches the ground"):
         check_touches(standing, lowest + 0.08)
+
+
+def test_a_clip_that_could_not_be_written_can_be_added_again(robot, clip, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(library, "file_hash", full)  # after the clip's file, before its entry
+        with pytest.raises(OSError, match="space"):
+            library.add_clip(tmp_path / "new", robot, clip, {})
+    library.add_clip(tmp_path / "new", robot, clip, {})
+    assert library.load_library(robot, tmp_path / "new").names == (clip.name,)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "found"),
+    [
+        ("fps", np.array([50.0, 60.0]), "fps: found float64 of shape [2]; numbers in 0 dimensions are needed"),
+        ("root_pos", np.array("far"), "root_pos: found str96 of shape []; numbers in 2 dimensions are needed"),
+        ("joint_names", np.zeros(29), "joint_names: found float64 of shape [29]; text in 1 dimensions are needed"),
+    ],
+)
+def test_a_field_of_another_kind_is_named(robot, folder, field, value, found):
+    with np.load(folder / "sway.npz") as archive:
+        content = dict(archive)
+    np.savez(folder / "sway.npz", **content | {field: value})
+    with pytest.raises(InputError, match=re.escape(found)):
+        read_clip(folder / "sway.npz")
+
+
+def test_a_member_that_is_no_array_is_named(folder):
+    with zipfile.ZipFile(folder / "sway.npz") as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(folder / "sway.npz", "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, b"not an array" if name == "joint_pos.npy" else content)
+    with pytest.raises(InputError, match=r"sway\.npz: joint_pos: found bytes96 of shape \[\]"):
+        read_clip(folder / "sway.npz")
