@@ -10,12 +10,10 @@ import jax
 import numpy as np
 import pytest
 from distributed import Client, LocalCluster
-from miniature import Run, finished, load_state
+from miniature import Run, load_state
 from waiting import until
 
-from forgetmimic_jax import unlearn
 from forgetmimic_jax.basics.provenance import cores
-from forgetmimic_jax.settings.options import parse
 from forgetmimic_jax.studies.executor import RESOURCE
 from forgetmimic_jax.studies.trials import Trial, make_trial, run_trials
 
@@ -60,10 +58,9 @@ def test_a_trial_whose_worker_is_killed_ends_on_the_other_as_it_would_have(clust
     assert first == 0
     assert 2 <= second < LENGTH
     assert f"finished: {trial.folder.name}" in capsys.readouterr().out
-    undisturbed = finished(
-        unlearn.main, parse(unlearn.Options, "unlearn", [*trial.flags, "--output", str(tmp_path / "undisturbed")])
-    )
-    disturbed = Run(trial.folder, printed)
+    other = make_trial(tmp_path / "undisturbed", options)
+    assert run_trials([other], jobs=1, cluster=cluster.scheduler_address, description="try") == {}
+    disturbed, undisturbed = (Run(each.folder, each.task.log.read_text()) for each in (trial, other))
     assert disturbed.rows == undisturbed.rows
     states = [load_state(run.checkpoint(LENGTH)) for run in (disturbed, undisturbed)]
     jax.tree.map(np.testing.assert_array_equal, *states)

@@ -54,12 +54,19 @@ def test_an_infeasible_clip_is_named_with_its_numbers(library_folder, monkeypatc
 
     def worse(robot, clip):
         found = measured(robot, clip)
-        return dataclasses.replace(found, missing_acceleration=9.5, motor_load=2.93) if clip.name == "nod" else found
+        if clip.name != "nod":
+            return found
+        worst = {
+            "missing_acceleration": " (at 0.62 s, frame 31)",
+            "motor_load": " (left_knee_joint at 0.24 s, frame 12)",
+        }
+        return dataclasses.replace(found, missing_acceleration=9.5, motor_load=2.93, worst=worst)
 
     monkeypatch.setattr(quality, "measure", worse)
     setup = make_setup(dataclasses.replace(preset("cpu"), library=str(library_folder)))
     pretrain.warn_of_infeasible(setup)
     assert capsys.readouterr().err.splitlines() == [
-        "warning: nod may be infeasible: for 0.2 s it needs 9.5 m/s^2 that no contact gives",
-        "warning: nod may be infeasible: for 0.1 s it needs 2.93 times a motor's torque limit",
+        "warning: nod may be infeasible: for 0.2 s it needs 9.5 m/s^2 that no contact gives (at 0.62 s, frame 31)",
+        "warning: nod may be infeasible: for 0.1 s it needs 2.93 times a motor's torque limit "
+        "(left_knee_joint at 0.24 s, frame 12)",
     ]
