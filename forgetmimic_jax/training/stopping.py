@@ -104,6 +104,7 @@ class Stopping(Plain):
                     f"iteration {position.iteration}: the targets' skill is at the zero-action baseline "
                     f"({self._skills[-1][1]:.0%}); {SETTLE} more iterations with a falling step size",
                     highlight=False,
+                    soft_wrap=True,
                 )
         return self._with_step_size(position)
 
