@@ -223,10 +223,13 @@ def _group_rows(document: EvaluationDocument, *, digits: int = 3) -> Rows:
 
 
 def _summary(document: EvaluationDocument) -> str:
-    """Success, tracking and skill of targets and kept clips, as a short Markdown table."""
+    """Success, tracking and skill of targets and kept clips, and the targets without terminations, in short."""
     table = _group_rows(document)
     shown = ("success", "tracking", "skill")
     rows = [row for row in table.rows if row[0].partition(" ")[2] in shown]
+    for without_terminations in unbounded_in_brief(document):
+        of_all_starts = without_terminations.rows[:3]
+        rows += [[f"target: {label}", *numbers] for label, *numbers in of_all_starts]
     return markdown_table(table.header, rows)
 
 
