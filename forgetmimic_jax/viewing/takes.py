@@ -59,7 +59,7 @@ def in_words(
     forgets = target and policy not in (BASE, ZERO_ACTION)
     follows = "" if ended is None else f"{'forgets' if forgets else 'leaves'} the motion at {ended:.2f} s"
     stands = f"stands {now:.2f} s" if fell is None else f"falls at {fell:.2f} s"
-    return follows, stands + (f", impact {impact:.1f} × its weight" if impact > 0.0 else "")
+    return follows, stands + (f", impact {impact:.1f} times its weight" if impact > 0.0 else "")
 
 
 def at(episode: Episode, policy: str, step: int) -> tuple[str, str]:

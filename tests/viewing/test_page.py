@@ -142,7 +142,7 @@ def test_a_forgotten_motion_shows_in_words_and_a_fall_as_a_red_frame(page):
     playback.fell, playback.impact = [None, 2], np.array([0.0, 3.21])
     page._show(plots=True)
     assert [lane._alarm.visible for lane in page._lanes] == [False, True]
-    fate = "forgets the motion at 0.02 s, falls at 0.04 s, impact 3.2 × its weight"
+    fate = "forgets the motion at 0.02 s, falls at 0.04 s, impact 3.2 times its weight"
     assert [lane._label.text for lane in page._lanes] == ["base", f"unlearned: {fate}"]
     assert page._status.content.splitlines()[1:] == [
         "- base: **0.70**, stands 0.04 s",

@@ -58,7 +58,7 @@ def test_an_episode_in_words():
     assert words("stand", True, None) == ("forgets the motion at 0.40 s", "stands 2.00 s")
     assert words("arft", True, 0.6, 7.25) == (
         "forgets the motion at 0.40 s",
-        "falls at 0.60 s, impact 7.2 × its weight",
+        "falls at 0.60 s, impact 7.2 times its weight",
     )
     assert words("base", True, None) == ("leaves the motion at 0.40 s", "stands 2.00 s")
     assert words("stand", False, None) == ("leaves the motion at 0.40 s", "stands 2.00 s")
