@@ -80,7 +80,7 @@ tables: .venv/.installed ## rewrite the README's tables and the studies' pages f
 	.venv/bin/python -m experiments.claims
 
 test: .venv/.installed ## run the tests
-	.venv/bin/python -m pytest --numprocesses=logical --maxprocesses=4 --dist=loadfile $(ARGS)
+	.venv/bin/python -m pytest --numprocesses=logical --maxprocesses=4 --dist=loadfile --no-loadscope-reorder $(ARGS)
 
 mutants: .venv/.installed ## see which faults of one line the tests notice (half an hour; ARGS=--list names them)
 	.venv/bin/python tests/mutants.py $(ARGS)
