@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 class Options:
     """Film one episode of each clip, base beside unlearned policy, and put stills of all clips on one page.
 
-    The episodes start at the clips' first frames. No termination ends them, and a target goes on for 3 s after its end
-    with the last frame held. Else the protocol is the evaluation's, on MuJoCo's C engine.
+    The episodes start at the clips' first frames. No termination ends them, and a target is played 3 s longer with its
+    last frame held. Else the protocol is the evaluation's, on MuJoCo's C engine.
     """
 
     robot: str = "g1"

@@ -187,15 +187,15 @@ def in_the_environment(setup: Setup, act: Callable, steps: int, clip: int = 0) -
 
     @jax.jit
     def step(assets, state, action):
-        asked = []
+        sent = []
 
         def stepped(physics, parameters, target, wrench):
-            asked.append(target)
+            sent.append(target)
             return env.engine.step(physics, parameters, target, wrench)
 
         watched = Environment(config, setup.robot, SimpleNamespace(step=stepped), 1, noisy=False)
         after, _ = tracking.step(watched, assets, state, action, KEY)
-        return after, asked[0]
+        return after, sent[0]
 
     observe = jax.jit(lambda assets, state: tracking.observe(env, assets, state, None)[0])
     act = act if isinstance(act, Deployed) else jax.jit(act)

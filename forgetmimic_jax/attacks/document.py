@@ -7,10 +7,9 @@ from pathlib import Path
 
 import msgspec
 
-from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.basics.files import write_atomically
 from forgetmimic_jax.basics.provenance import Provenance
-from forgetmimic_jax.evaluation.document import Estimate, UnboundedResult
+from forgetmimic_jax.evaluation.document import Estimate, UnboundedResult, read_document
 
 SCHEMA = 1
 FILE = "evidence.json"
@@ -157,15 +156,7 @@ def read_evidence(path: Path) -> EvidenceDocument:
     Raises:
         InputError: no such file, or a damaged or foreign one.
     """
-    try:
-        content = json.loads(path.read_text())
-        if content["schema"] != SCHEMA:
-            raise InputError(f"{path}: schema: found {content['schema']!r}; accepted: {SCHEMA}")
-        return msgspec.convert(content, EvidenceDocument)
-    except FileNotFoundError:
-        raise InputError(f"{path}: not found") from None
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: not evidence, or damaged: {type(error).__name__}: {error}") from None
+    return read_document(path, SCHEMA, "evidence", lambda content: msgspec.convert(content, EvidenceDocument))
 
 
 def write_document(path: Path, document: object) -> None:

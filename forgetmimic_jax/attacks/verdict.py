@@ -32,6 +32,7 @@ from forgetmimic_jax.evaluation.verdict import (
     Verdict,
     as_skill,
     losses,
+    pace_over_seeds,
     retained,
     sooner_than_control,
     steps_in_words,
@@ -207,13 +208,7 @@ def _pace(relearning: Relearning | None) -> tuple[bool | None, str]:
         short.append(f"{_bound(ours)} against {_bound(theirs)}")
     words = f"{steps_in_words(pairs)} until {_bound(RELEARNED)} of the base's tracking"
     words += f"; after the same target steps neither got there: {', '.join(short)}" if short else ""
-    if faster and all(faster):
-        return True, f"It relearns the targets faster than the control: {words}."
-    if any(faster):
-        return None, f"With some seeds it relearns the targets faster than the control: {words}."
-    if None in faster or not faster:
-        return None, f"Relearning was stopped too early to compare: {words}."
-    return False, f"It does not relearn the targets faster than the control: {words}."
+    return pace_over_seeds(faster, words)
 
 
 def reached(relearning: Relearning, seed: str) -> tuple[float, float]:

@@ -6,9 +6,9 @@ Tables, figures, the verdict and the report take an `EvaluationDocument`; none o
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import msgspec
 
@@ -19,6 +19,7 @@ from forgetmimic_jax.evaluation.metrics import BASE, UNLEARNED, ZERO_ACTION
 
 SCHEMA = 1
 FILE = "evaluation.json"
+T = TypeVar("T")
 
 
 class Estimate(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -149,18 +150,37 @@ def read_evaluation(path: Path) -> EvaluationDocument:
     Raises:
         InputError: no such file, or a damaged or foreign one.
     """
-    try:
-        content = json.loads(path.read_text())
-        if content["schema"] != SCHEMA:
-            raise InputError(f"{path}: schema: found {content['schema']!r}; accepted: {SCHEMA}")
+
+    def document(content: dict[str, Any]) -> EvaluationDocument:
         policies = {name: policy_result(policy) for name, policy in content["policies"].items()}
         return msgspec.structs.replace(
             msgspec.convert({**content, "policies": {}}, EvaluationDocument), policies=policies
         )
+
+    return read_document(path, SCHEMA, "an evaluation", document)
+
+
+def read_document(path: Path, schema: int, kind: str, document: Callable[[dict[str, Any]], T]) -> T:
+    """The typed document in a JSON file.
+
+    Args:
+        path: the file.
+        schema: the only accepted value of its field `schema`.
+        kind: what the file should be, with its article; for the error.
+        document: makes the document of the file's content.
+
+    Raises:
+        InputError: no such file, or a damaged or foreign one.
+    """
+    try:
+        content = json.loads(path.read_text())
+        if content["schema"] != schema:
+            raise InputError(f"{path}: schema: found {content['schema']!r}; accepted: {schema}")
+        return document(content)
     except FileNotFoundError:
         raise InputError(f"{path}: not found") from None
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{path}: not an evaluation, or damaged: {type(error).__name__}: {error}") from None
+        raise InputError(f"{path}: not {kind}, or damaged: {type(error).__name__}: {error}") from None
 
 
 def write_evaluation(path: Path, document: EvaluationDocument) -> None:

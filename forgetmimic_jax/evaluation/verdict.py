@@ -9,7 +9,7 @@ it. Where that leaves no target or no kept clip, the verdict is inconclusive.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import inf
 from typing import NamedTuple
@@ -220,14 +220,23 @@ def _relearning_pace(relearning: Mapping[str, tuple[Lasted, Lasted]] | NotMeasur
     """Whether the policy relearns the targets faster than the control, None where that is not sure; in words."""
     if isinstance(relearning, NotMeasured):
         return None, relearning.reason
-    sooner = [sooner_than_control(*pair) for pair in relearning.values()]
-    if sooner and all(sooner):
-        return True, f"It relearns the targets faster than the control: {steps_in_words(relearning)}."
-    if any(sooner):
-        return None, f"With some seeds it relearns the targets faster than the control: {steps_in_words(relearning)}."
-    if None in sooner or not sooner:
-        return None, f"Relearning was stopped too early to compare: {steps_in_words(relearning)}."
-    return False, f"It does not relearn the targets faster than the control: {steps_in_words(relearning)}."
+    return pace_over_seeds([sooner_than_control(*pair) for pair in relearning.values()], steps_in_words(relearning))
+
+
+def pace_over_seeds(faster: Sequence[bool | None], numbers: str) -> tuple[bool | None, str]:
+    """Whether the policy relearns the targets faster than the control, with every seed; None where that is not sure.
+
+    Args:
+        faster: of each seed; None where a run ended before that could be seen.
+        numbers: what was measured, for the sentence.
+    """
+    if faster and all(faster):
+        return True, f"It relearns the targets faster than the control: {numbers}."
+    if any(faster):
+        return None, f"With some seeds it relearns the targets faster than the control: {numbers}."
+    if None in faster or not faster:
+        return None, f"Relearning was stopped too early to compare: {numbers}."
+    return False, f"It does not relearn the targets faster than the control: {numbers}."
 
 
 def sooner_than_control(unlearned: Lasted, control: Lasted) -> bool | None:

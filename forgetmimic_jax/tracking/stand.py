@@ -36,30 +36,25 @@ def stand_frame(robot: Robot) -> Frames:
     return jax.tree.map(lambda values: values[0, 0], stand_library(robot).frames)
 
 
-def fallen(robot: Robot, bodies: Bodies) -> Array:
-    """bool[env]: the robot is `low`, or it is `tilted`.
+def low(robot: Robot, bodies: Bodies) -> Array:
+    """bool[env]: the root is below half of its standing height.
 
     Args:
         robot: whose bodies they are.
         bodies: [env, key_body].
     """
-    return low(robot, bodies) | tilted(robot, bodies)
-
-
-def low(robot: Robot, bodies: Bodies) -> Array:
-    """bool[env]: the root is below half of its standing height; arguments as in `fallen`."""
     return bodies.pos[:, robot.root, 2] < FALL_HEIGHT * robot.default_height
 
 
 def tilted(robot: Robot, bodies: Bodies) -> Array:
-    """bool[env]: the anchor is tilted by more than 60 degrees; arguments as in `fallen`."""
+    """bool[env]: the anchor is tilted by more than 60 degrees; arguments as in `low`."""
     quat = bodies.quat[:, robot.anchor]
     up = rotation.rotate(quat, jnp.zeros_like(bodies.pos[:, robot.anchor]).at[:, 2].set(1.0))
     return up[:, 2] < np.cos(FALL_TILT)
 
 
 def falls(robot: Robot, before: Bodies, after: Bodies) -> Array:
-    """bool[env]: the robot is low or tilted after a step, and was not so before it; arguments as in `fallen`.
+    """bool[env]: the robot is low or tilted after a step, and was not so before it; arguments as in `low`.
 
     So a robot that lies at the start of a clip of getting up does not fall, and one that leans in the middle of a kick
     falls when it is low.

@@ -90,19 +90,19 @@ def memory(setup: Setup) -> Figures:
     config = setup.config
     env, assets = tracking.make_environment(setup, config.ppo.num_envs), tracking.make_assets(setup)
     iteration = jax.jit(make_iteration(env, Rule()), donate_argnums=1)
-    found = iteration.lower(assets, template(env, assets)).compile().memory_analysis()
+    state = template(env, assets)
+    found = iteration.lower(assets, state).compile().memory_analysis()
     assert found is not None  # every backend of JAX that this program runs on has it
-    state = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(template(env, assets)))
-    rollout = found.temp_size_in_bytes
     return {
         "engine": resolve_engine(config.physics.engine),
         "environments": env.num_envs,
-        "state_gib": state / GIB,
+        "state_gib": sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state)) / GIB,
         "arguments_gib": found.argument_size_in_bytes / GIB,
-        "temporary_gib": rollout / GIB,
+        "temporary_gib": found.temp_size_in_bytes / GIB,
         "program_gib": found.generated_code_size_in_bytes / GIB,
         # The state is donated: its memory is used again for the result.
-        "together_gib": (found.argument_size_in_bytes + rollout + found.generated_code_size_in_bytes) / GIB,
+        "together_gib": (found.argument_size_in_bytes + found.temp_size_in_bytes + found.generated_code_size_in_bytes)
+        / GIB,
     }
 
 

@@ -69,10 +69,10 @@ def test_unlearning_evaluation_and_viewers_go_by_the_bases_layout(case, base, un
 
 def test_what_the_zero_action_does_is_said_by_its_mode(case, unlearned):
     does = {"residual": "replay the clip", "offset": "hold the default pose"}
-    told, other = does[case[1]], does["offset" if case[1] == "residual" else "residual"]
+    message, other = does[case[1]], does["offset" if case[1] == "residual" else "residual"]
     for text in (unlearned.printed, (unlearned.folder / "evaluation.md").read_text()):
         text = " ".join(text.split())
-        assert f"the joint controllers {told} without a policy" in text
+        assert f"the joint controllers {message} without a policy" in text
         assert other not in text
 
 
@@ -107,8 +107,8 @@ def test_an_older_evaluation_is_of_residual_actions(unlearned, tmp_path):
 def test_another_layout_than_the_bases_is_refused(base, refused, case, library_folder):
     set_ = [TINY, ["observation.layout=wbc132"]]
     options = train.Options(library=library_folder, base=base.checkpoint(1), set=set_)
-    told = refused(train.main, options)
-    assert told == f"{base.checkpoint(1)}: observation.layout: the checkpoint's is {case[0]}, this run's wbc132"
+    message = refused(train.main, options)
+    assert message == f"{base.checkpoint(1)}: observation.layout: the checkpoint's is {case[0]}, this run's wbc132"
 
 
 def test_a_checkpoint_of_the_layout_is_evaluated(base, tmp_path):

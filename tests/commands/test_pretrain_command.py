@@ -38,15 +38,15 @@ def test_a_library_of_ones_own_starts_from_the_shipped_base_with_its_observation
 
 
 def test_what_the_phases_cannot_work_with_is_told_in_one_line(refused, library_folder):
-    def told(*settings: str) -> str:
+    def refusal_of(*settings: str) -> str:
         options = pretrain.Options(library=library_folder, base=Path("none"), set=[[*PHASES, *settings]])
         return refused(pretrain.main, options)
 
     every = "accepted: a multiple of checkpoint_every = 2, from it on"
-    assert told("evaluate_every=0") == f"evaluate_every: found 0; {every}"
-    assert told("evaluate_every=3") == f"evaluate_every: found 3; {every}"
-    assert told("ppo.schedule=fixed") == "ppo.schedule: found fixed; accepted: adaptive, adaptive_iteration"
-    assert told("pretrain.patience=0") == "--set: pretrain.patience: found 0; accepted: a whole number from 1"
+    assert refusal_of("evaluate_every=0") == f"evaluate_every: found 0; {every}"
+    assert refusal_of("evaluate_every=3") == f"evaluate_every: found 3; {every}"
+    assert refusal_of("ppo.schedule=fixed") == "ppo.schedule: found fixed; accepted: adaptive, adaptive_iteration"
+    assert refusal_of("pretrain.patience=0") == "--set: pretrain.patience: found 0; accepted: a whole number from 1"
 
 
 def test_an_infeasible_clip_is_named_with_its_numbers(library_folder, monkeypatch, capsys):

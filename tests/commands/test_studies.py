@@ -278,7 +278,7 @@ def test_what_is_finished_when_it_is_stopped_is_told(swept, base_run, tmp_path, 
     assert list(document["results"]["variants"]["λ = 16"]["seeds"]) == ["0"]
     assert list(document["failed"].values()) == ["stopped"]
     assert "`: stopped\n" in (tmp_path / "out" / "seeds.md").read_text()
-    stop(after=0)  # and wanted again, it goes on with what is missing
+    stop(after=0)  # and wanted again, it continues with what is missing
     document = json.loads((tmp_path / "out" / "seeds.json").read_text())
     assert list(document["results"]["variants"]["λ = 16"]["seeds"]) == ["0"]
 

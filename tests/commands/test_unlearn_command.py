@@ -439,7 +439,7 @@ def test_another_robot_learns_from_the_first_forgets_and_is_evaluated_on_its_own
     assert document["robot"] == "h2"
     assert document["targets"] == ["punch", "kick"]
     assert set(document["policies"]["unlearned"]["clips"]) == set(read_manifest(DATA_DIR / "h2")["clips"])
-    # A robot of 76 kg that stands where the reference stands lives for some steps.
+    # A robot of 76 kg that stands where the reference stands stays up for some steps.
     assert document["policies"]["zero_action"]["kept"]["episode_length"]["mean"] > 5.0
 
 

@@ -87,23 +87,27 @@ NAMES_AND_BODY = {
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_the_metadata_name_the_terms_of_the_layout_and_the_body_that_they_are_of(robot, tiny_config, layout):
     config = dataclasses.replace(tiny_config, observation=ObservationConfig(layout))
-    told = metadata(robot, config, run_path="")
-    assert (told["observation_names"], told["anchor_body_name"]) == NAMES_AND_BODY[layout]
+    meta = metadata(robot, config, run_path="")
+    assert (meta["observation_names"], meta["anchor_body_name"]) == NAMES_AND_BODY[layout]
 
 
 def test_the_metadata_are_in_the_policys_order_and_say_what_its_actions_are_added_to(robot, tiny_config):
     order = isaac_order(robot)
     action = ActionConfig("offset", order, default_pose={"left_knee_joint": 0.5}, stiffness={"waist_yaw_joint": 77.0})
     mine = load_robot("g1", action=action)
-    told = metadata(mine, dataclasses.replace(tiny_config, action=action), run_path="")
-    assert told["action_mode"] == "default_relative"
+    meta = metadata(mine, dataclasses.replace(tiny_config, action=action), run_path="")
+    assert meta["action_mode"] == "default_relative"
     # Isaac Lab: left hip pitch, right hip pitch, waist yaw; the tenth is the left knee.
-    assert told["joint_names"].split(",")[:3] == ["left_hip_pitch_joint", "right_hip_pitch_joint", "waist_yaw_joint"]
-    values = {key: [float(item) for item in told[key].split(",")] for key in ("default_joint_pos", "joint_stiffness")}
+    assert meta["joint_names"].split(",")[:3] == [
+        "left_hip_pitch_joint",
+        "right_hip_pitch_joint",
+        "waist_yaw_joint",
+    ]
+    values = {key: [float(item) for item in meta[key].split(",")] for key in ("default_joint_pos", "joint_stiffness")}
     assert values["default_joint_pos"][:3] == pytest.approx([-0.312, -0.312, 0.0])
     assert values["default_joint_pos"][9:11] == pytest.approx([0.5, 0.669])
     assert values["joint_stiffness"][2] == 77.0
-    assert [float(item) for item in told["action_scale"].split(",")][-2:] == pytest.approx([0.0745, 0.0745], abs=1e-4)
+    assert [float(item) for item in meta["action_scale"].split(",")][-2:] == pytest.approx([0.0745, 0.0745], abs=1e-4)
 
 
 def test_gains_and_scales_read_back_to_the_last_digit(actor, robot):

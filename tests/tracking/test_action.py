@@ -38,11 +38,11 @@ def step(request, robot, library, tiny_config, mode):
     config = dataclasses.replace(tiny_config, observation=ObservationConfig("mjlab154"), action=action)
     mine = load_robot("g1", action=action)
     assets = make_assets(Setup(config, mine, library, ""))
-    asked = {}
+    sent = {}
 
     def stay(state, parameters, target, wrench):
-        asked["target"] = np.asarray(target)[0]
-        return state, asked["bodies"]
+        sent["target"] = np.asarray(target)[0]
+        return state, sent["bodies"]
 
     env = Environment(config, mine, SimpleNamespace(step=stay), 1, noisy=False)
 
@@ -50,11 +50,11 @@ def step(request, robot, library, tiny_config, mode):
         clip, frame, gain = jnp.array([CLIP]), jnp.array([FRAME]), jnp.zeros(1)
         state = tracking.start_episodes(env, assets, KEY, clip, clip, frame, gain)
         state = dataclasses.replace(state, encoder_bias=jnp.full((1, 29), bias))
-        asked["bodies"] = state.bodies
+        sent["bodies"] = state.bodies
         raw = np.array([output.get(name, 0.0) for name in order or robot.joint_names], np.float32)
         after, _ = tracking.step(env, assets, state, jnp.asarray(raw)[None], KEY)
         seen, _ = tracking.observe(env, assets, after, None)
-        targets = dict(zip(robot.joint_names, asked["target"], strict=True))
+        targets = dict(zip(robot.joint_names, sent["target"], strict=True))
         return targets, raw, np.asarray(seen)[0, LAYOUTS["mjlab154"].places(29)["actions"]]
 
     return step
@@ -125,7 +125,7 @@ def test_a_setup_has_the_robot_that_its_policy_expects(tiny_config, library_fold
 
 
 @pytest.mark.parametrize(
-    ("action", "told"),
+    ("action", "message"),
     [
         (ActionConfig(stiffness={"left_kne_joint": 1.0}), "action.stiffness: no joint 'left_kne_joint' in g1; did you "
          "mean 'left_knee_joint'?"),
@@ -135,10 +135,10 @@ def test_a_setup_has_the_robot_that_its_policy_expects(tiny_config, library_fold
         (ActionConfig(joint_order=("left_knee_joint",) * 29), "action.joint_order: found 29 joints (unknown: none; "),
     ],
 )  # fmt: skip
-def test_joints_that_are_not_the_robots_are_told(action, told):
+def test_joints_that_are_not_the_robots_are_told(action, message):
     with pytest.raises(InputError) as error:
         load_robot("g1", action=action)
-    assert str(error.value).startswith(told)
+    assert str(error.value).startswith(message)
 
 
 def test_a_joint_target_as_an_action(robot, mode):

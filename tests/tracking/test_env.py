@@ -366,10 +366,10 @@ def test_a_reference_of_constant_velocity_needs_the_weight_and_no_torque(robot, 
 
 
 def test_the_wrench_carries_the_robot_and_does_not_tear_it_apart(robot, tiny_config, library):
-    """At its full gain the zero action lives longer, although the torque of a whole robot's inertia acts on the torso:
-    held for a control step it would shake it to pieces within a few steps."""
+    """At its full gain an episode of the zero action is longer, although the torque of a whole robot's inertia acts on
+    the torso: held for a control step it would shake it to pieces within a few steps."""
     envs, steps = 16, 40
-    steps_lived = []
+    mean_steps = []
     for gain in (0.0, 0.6):
         config = dataclasses.replace(
             tiny_config,
@@ -383,15 +383,15 @@ def test_the_wrench_carries_the_robot_and_does_not_tear_it_apart(robot, tiny_con
         state = tracking.refresh_bodies(env, state, jnp.ones(envs, bool))
         advance = jax.jit(lambda assets, state, key, env=env: tracking.step(
             env, assets, state, jnp.zeros((envs, robot.num_joints)), key))  # fmt: skip
-        alive, lived = np.ones(envs, bool), 0
+        alive, steps_alive = np.ones(envs, bool), 0
         for step in range(steps):
             state, result = advance(assets, state, jax.random.PRNGKey(step))
             assert not result.diverged.any()
             assert np.abs(result.reward.regularisation)[alive].max(initial=0.0) < 1.0
             alive &= ~np.asarray(result.terminated)
-            lived += alive.sum()
-        steps_lived.append(lived / envs)
-    assert steps_lived[1] > 1.2 * steps_lived[0]
+            steps_alive += alive.sum()
+        mean_steps.append(steps_alive / envs)
+    assert mean_steps[1] > 1.2 * mean_steps[0]
 
 
 def test_pushes_come_when_the_countdown_is_over_and_then_after_the_drawn_interval(robot, tiny_config, assets):

@@ -147,16 +147,16 @@ def test_a_better_tracked_bin_is_drawn_less():
 
 
 def test_an_early_death_is_a_failure_although_it_tracked_well_while_alive():
-    lived = dict(tracking_sum=jnp.array(9.0), steps=jnp.array(10), horizon=jnp.array(100))
-    assert float(episode_failure(SamplingConfig(), **lived)) == pytest.approx(0.91)
+    episode = dict(tracking_sum=jnp.array(9.0), steps=jnp.array(10), horizon=jnp.array(100))
+    assert float(episode_failure(SamplingConfig(), **episode)) == pytest.approx(0.91)
     literal = SamplingConfig(failure_signal="alive_mean")
-    assert float(episode_failure(literal, **lived)) == pytest.approx(0.1)
+    assert float(episode_failure(literal, **episode)) == pytest.approx(0.1)
 
 
 def test_both_failure_signals_agree_on_an_episode_that_lived_to_its_end():
-    lived = dict(tracking_sum=jnp.array(60.0), steps=jnp.array(80), horizon=jnp.array(80))
+    episode = dict(tracking_sum=jnp.array(60.0), steps=jnp.array(80), horizon=jnp.array(80))
     for signal in ("survival_weighted", "alive_mean"):
-        assert float(episode_failure(SamplingConfig(failure_signal=signal), **lived)) == pytest.approx(0.25)
+        assert float(episode_failure(SamplingConfig(failure_signal=signal), **episode)) == pytest.approx(0.25)
 
 
 def one_update(level, ended: list[tuple[int, int, float]], config=SamplingConfig()):  # noqa: B008 (frozen)

@@ -9,8 +9,9 @@ from scene import as_reference, on_reference, posed, turned
 from scipy.spatial.transform import Rotation
 
 from forgetmimic_jax.robot.model import load_robot
+from forgetmimic_jax.tracking import stand
 from forgetmimic_jax.tracking.reference import at_anchor
-from forgetmimic_jax.tracking.stand import fallen, stand_frame, stand_library
+from forgetmimic_jax.tracking.stand import stand_frame, stand_library
 
 
 @pytest.mark.parametrize("name", ["g1", "h2"])
@@ -32,6 +33,11 @@ def test_the_stand_lasts_as_long_as_asked(robot):
     library = stand_library(robot, frames=7)
     assert (library.names, int(library.length[0])) == (("stand",), 7)
     np.testing.assert_array_equal(library.frames.joint_pos[0, 6], library.frames.joint_pos[0, 0])
+
+
+def fallen(robot, bodies):
+    """By one of the two rules of a fall."""
+    return stand.low(robot, bodies) | stand.tilted(robot, bodies)
 
 
 def test_a_robot_in_its_default_pose_has_not_fallen(robot):

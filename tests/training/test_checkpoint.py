@@ -281,7 +281,7 @@ def test_a_checkpoint_of_another_layout_does_not_match(copy, setup):
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         ({"mode": "offset"}, "action.mode: the checkpoint's is residual, this run's offset"),
         (
@@ -292,12 +292,12 @@ def test_a_checkpoint_of_another_layout_does_not_match(copy, setup):
         ({"joint_order": ("a", "b")}, "action.joint_order: the checkpoint's is [], this run's ['a', 'b']"),
     ],
 )
-def test_a_checkpoint_whose_actions_mean_something_else_does_not_match(saved, setup, change, told):
+def test_a_checkpoint_whose_actions_mean_something_else_does_not_match(saved, setup, change, message):
     action = dataclasses.replace(setup.config.action, **change)
     other = dataclasses.replace(setup, config=dataclasses.replace(setup.config, action=action))
     with pytest.raises(InputError) as error:
         checkpoint.check_matches(read_info(saved), other)
-    assert str(error.value).removeprefix(f"{saved}: ").startswith(told)
+    assert str(error.value).removeprefix(f"{saved}: ").startswith(message)
 
 
 def test_another_robots_actions_may_differ_in_all_but_their_mode(saved, setup):
