@@ -162,6 +162,7 @@ def test_a_robot_without_shapes_to_be_seen_is_drawn_by_those_it_collides_with(ro
 
 def test_where_nothing_can_be_drawn_one_line_says_what_to_install(monkeypatch):
     monkeypatch.setattr(offscreen.platform, "system", lambda: "Linux")
+    monkeypatch.setattr(offscreen, "chosen_library", lambda: "")
     monkeypatch.setattr(offscreen.sys, "executable", "/bin/false")
     offscreen._backend.cache_clear()
     try:
