@@ -1,4 +1,4 @@
-"""Figures of evaluation.json, metrics.jsonl and studies. matplotlib is loaded only when a figure is drawn.
+"""Figures of evaluations, also of those while training, and of studies; matplotlib is loaded only to draw one.
 
 `path` is where a figure goes: a PNG file, or a text buffer, which gets SVG.
 """
@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 import msgspec
 
-from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.basics.files import read_rows
 from forgetmimic_jax.evaluation.document import Estimate, EvaluationDocument
 from forgetmimic_jax.evaluation.tables import clip_order, policy_order
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-STEPS = ("iteration", "environment_steps")
 STATE_COLOURS = {"new": "0.93", "learning": "#fff3d6", "mastered": "#dcf2dc", "stuck": "#f9dcdc"}
 GROUP_COLOURS = {"target": "tab:red", "kept": "tab:blue"}
 
@@ -43,35 +41,6 @@ def clip_bars(
         bars(axes, clips, {policy: [of[policy][clip].metric(metric) for clip in clips] for policy in policies})
         axes.set_ylabel(metric.replace("_", " "))
     figure.axes[0].legend(ncols=min(4, len(policies)), loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
-    save(figure, path)
-
-
-def training_curves(metrics_file: Path, path: Path | TextIO, *, keys: Sequence[str] | None = None) -> None:
-    """One panel a key of a metrics.jsonl over environment steps.
-
-    Args:
-        metrics_file: one JSON object a line with iteration, environment_steps and numbers.
-        path: where it goes.
-        keys: which numbers to draw; all that are there by default.
-
-    Raises:
-        InputError: no line to draw, or a key that no line has.
-    """
-    lines = read_rows(metrics_file)
-    present = sorted({key for line in lines for key, value in line.items() if isinstance(value, int | float)})
-    keys = [key for key in present if key not in STEPS] if keys is None else keys
-    missing = [key for key in keys if key not in present]
-    if not keys or missing:
-        raise InputError(f"{metrics_file}: nothing to draw: no {', '.join(missing) or 'numbers'} in its lines")
-    columns = min(4, len(keys))
-    rows = -(-len(keys) // columns)
-    figure = new_figure(width=3.5 * columns, height=2.3 * rows)
-    for panel, key in enumerate(keys):
-        axes = figure.add_subplot(rows, columns, panel + 1)
-        points = [(line["environment_steps"], line[key]) for line in lines if key in line]
-        axes.plot(*zip(*points, strict=True))
-        axes.set_title(key.replace("_", " "), fontsize="small")
-        axes.set_xlabel("environment steps", fontsize="small")
     save(figure, path)
 
 

@@ -18,7 +18,7 @@ from forgetmimic_jax.evaluation.document import (
     to_dict,
     write_evaluation,
 )
-from forgetmimic_jax.evaluation.plots import clip_bars, training_curves
+from forgetmimic_jax.evaluation.plots import clip_bars
 from forgetmimic_jax.evaluation.summary import evaluate_policies
 from forgetmimic_jax.evaluation.tables import fill, markdown, render_table
 
@@ -243,13 +243,7 @@ def test_readme_blocks_are_filled_from_the_file_they_name(tmp_path, document):
 
 def test_figures_are_written(tmp_path, document):
     clip_bars(document, tmp_path / "clips.png")
-    curves = tmp_path / "metrics.jsonl"
-    curves.write_text('{"iteration": 0, "environment_steps": 0, "kl": 0.1}\n{"iteration": 1, "environment_steps": 5}\n')
-    training_curves(curves, tmp_path / "curves.png")
-    for name in ("clips.png", "curves.png"):
-        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
-    with pytest.raises(InputError, match="no loss in its lines"):
-        training_curves(curves, tmp_path / "other.png", keys=["loss"])
+    assert (tmp_path / "clips.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_runs_clips_are_drawn_over_its_environment_steps(tmp_path, monkeypatch):
