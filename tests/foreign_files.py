@@ -116,11 +116,11 @@ def metadata(robot: Robot, layout: str, seed: int = 0) -> dict[str, str]:
 
 def clip_tables(library, clip: int = 0) -> dict[str, np.ndarray]:
     """A clip as mjlab's exporter writes it, in the robot's order."""
-    frames, length = library.frames, int(library.length[clip])
+    frames = library.clip(clip)
     bodies = frames.bodies
     found = {"joint_pos": frames.joint_pos, "joint_vel": frames.joint_vel, "body_pos_w": bodies.pos}
     found |= {"body_quat_w": bodies.quat, "body_lin_vel_w": bodies.lin_vel, "body_ang_vel_w": bodies.ang_vel}
-    return {name: np.array(values)[clip, :length] for name, values in found.items()}
+    return {name: np.array(values) for name, values in found.items()}
 
 
 def mjlab_file(path: Path, robot: Robot, library, layout: str = "mjlab160", **changes: str | None) -> Path:

@@ -98,7 +98,7 @@ def from_config_yaml(file: Path, table: Path) -> Deployment:
 def in_its_own_loop(deployment: Deployment, robot: Robot, library, steps: int, clip: int = 0) -> np.ndarray:
     """Joint targets [step, joint] in the robot's order, from the clip's first frame on."""
     place = np.array([robot.joint_names.index(joint) for joint in deployment.joints])
-    reference = jax.tree.map(lambda values: np.asarray(values, np.float64)[clip], library.frames)
+    reference = jax.tree.map(lambda values: values.astype(np.float64), library.clip(clip))
     model = copy.copy(robot.model)
     model.actuator_gainprm[place, 0] = deployment.stiffness
     model.actuator_biasprm[place, 1], model.actuator_biasprm[place, 2] = -deployment.stiffness, -deployment.damping

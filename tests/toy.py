@@ -72,7 +72,7 @@ class ToyStage:
         horizon = last - self.start_frame
         steps = np.arange(horizon.max())
         frame = np.minimum(self.start_frame[:, None] + steps + 1, last[:, None])
-        joints = np.asarray(self._library.frames.joint_pos)[self.clip[:, None], frame]
+        joints = np.asarray(self._library.at(self.clip[:, None], frame).joint_pos)
         features = sum(place.stop - place.start for place in self._place.values())
         observation = np.zeros((joints.shape[0] * joints.shape[1], features), np.float32)
         observation[:, self._place["ref_joint_pos"]] = joints.reshape(-1, joints.shape[-1])

@@ -79,7 +79,7 @@ def filtered(
     first = places.get("ref_joint_pos", places.get("command"))
     assert first is not None
     projection = jax.random.normal(jax.random.PRNGKey(1), (robot.num_joints, 3)) / jnp.sqrt(robot.num_joints)
-    joints = library.frames.joint_pos[..., robot.policy_joints].reshape(-1, robot.num_joints)
+    joints = library.frames.joint_pos[:, robot.policy_joints]
     return Filtered(policy, joints @ projection, projection, first.start, instead, elsewhere)
 
 

@@ -58,14 +58,15 @@ def run_episodes(
         start: the episodes (`Evaluator.start`).
         report: called after each episode with the number of episodes and control steps done.
     """
-    reference = jax.tree.map(lambda values: np.asarray(values, np.float64), library.frames)
+    numbers = range(len(library.names))
+    references = [jax.tree.map(lambda values: values.astype(np.float64), library.clip(number)) for number in numbers]
     clips, frames, horizons = (np.asarray(x) for x in (start.clip, start.frame, start.horizon))
     deployed = Deployed(actor, robot)
     episodes: list[dict[str, np.ndarray]] = []
     for clip, frame, horizon, qpos, qvel in zip(
         clips, frames, horizons, np.asarray(start.physics.qpos), np.asarray(start.physics.qvel), strict=True
     ):
-        ahead = jax.tree.map(lambda values: values[clip, frame + 1 : frame + 1 + horizon], reference)  # noqa: B023
+        ahead = jax.tree.map(lambda values: values[frame + 1 : frame + 1 + horizon], references[clip])  # noqa: B023
         episodes.append(_run_episode(deployed, ahead, config.physics.substeps, qpos, qvel))
         report(len(episodes), sum(len(episode["action"]) for episode in episodes))
     steps = {name: np.concatenate([episode[name] for episode in episodes]) for name in episodes[0]}

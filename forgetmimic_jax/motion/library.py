@@ -1,4 +1,4 @@
-"""The motion library: clips of one robot as padded arrays [clip, frame, ...] for the training, and its folder.
+"""The motion library: clips of one robot, one after the other in arrays [frame, ...] for the training, and its folder.
 
 A folder holds one NAME.npz a clip and manifest.json with each file's hash, origin and settings.
 """
@@ -35,7 +35,7 @@ MAX_ANGULAR_ACCELERATION = 100.0  # rad/s^2
 
 @struct.dataclass
 class Frames:
-    """Frames of reference motion. Leading dimensions are free: [frame], [clip, frame] or [env]."""
+    """Frames of reference motion. Leading dimensions are free: [frame] or [env]."""
 
     joint_pos: Values  # [..., joint] rad
     joint_vel: Values  # [..., joint] rad/s
@@ -46,18 +46,26 @@ class Frames:
 
 @struct.dataclass
 class MotionLibrary:
-    """Reference motions of one robot.
+    """Reference motions of one robot."""
 
-    Frames past a clip's end repeat its last frame.
-    """
-
-    frames: Frames  # [clip, frame]
+    frames: Frames  # [frame] of all clips, one clip after the other
+    start: Array  # i32[clip] where each clip begins
     length: Array  # i32[clip] frames of each clip
     names: tuple[str, ...] = struct.field(pytree_node=False)
 
+    def at(self, clip: Array | int, frame: Array | int) -> Frames:
+        """Frames of clips, both of any one shape; past a clip's end its last frame."""
+        place = self.start[clip] + jnp.minimum(frame, self.length[clip] - 1)
+        return jax.tree.map(lambda values: values[place], self.frames)
+
+    def clip(self, clip: int) -> Frames:
+        """All frames of a clip [frame], as numpy arrays."""
+        first, length = int(self.start[clip]), int(self.length[clip])
+        return jax.tree.map(lambda values: np.asarray(values)[first : first + length], self.frames)
+
 
 def build_library(robot: Robot, clips: Sequence[Clip], fps: float = 50.0) -> MotionLibrary:
-    """Resample clips to the control rate `fps` in Hz, derive body motion, and pad.
+    """Resample clips to the control rate `fps` in Hz, and derive body motion.
 
     Raises:
         InputError: no clip, or a clip with other joints than the robot's.
@@ -68,19 +76,7 @@ def build_library(robot: Robot, clips: Sequence[Clip], fps: float = 50.0) -> Mot
     for clip in clips:
         _check_joints(clip, robot)
         rows.append(_frames(robot, clip if clip.fps == fps else resample(clip, fps)))
-    lengths = [len(row.joint_pos) for row in rows]
-
-    def padded(*values: np.ndarray) -> Array:
-        stacked = np.empty((len(values), max(lengths), *values[0].shape[1:]), np.float32)
-        for row, value in zip(stacked, values, strict=True):
-            row[: len(value)], row[len(value) :] = value, value[-1]
-        return jnp.asarray(stacked)
-
-    return MotionLibrary(
-        frames=jax.tree.map(padded, *rows),
-        length=jnp.asarray(lengths, jnp.int32),
-        names=tuple(clip.name for clip in clips),
-    )
+    return _one_after_the_other(rows, [clip.name for clip in clips])
 
 
 def load_library(
@@ -101,14 +97,14 @@ def load_library(
 
 
 def only_clips(library: MotionLibrary, names: Sequence[str]) -> MotionLibrary:
-    """The clips called `names`, in this order, without the frames that only longer clips have."""
-    chosen = np.array([library.names.index(name) for name in names])
-    frames = int(np.asarray(library.length)[chosen].max())
-    return MotionLibrary(
-        frames=jax.tree.map(lambda values: values[chosen, :frames], library.frames),
-        length=library.length[chosen],
-        names=tuple(names),
-    )
+    """The clips called `names`, in this order."""
+    return _one_after_the_other([library.clip(library.names.index(name)) for name in names], names)
+
+
+def together(*libraries: MotionLibrary) -> MotionLibrary:
+    """The clips of several libraries."""
+    rows = [library.clip(clip) for library in libraries for clip in range(len(library.names))]
+    return _one_after_the_other(rows, [name for library in libraries for name in library.names])
 
 
 def read_library(robot: Robot, path: Path | None = None, clips: Sequence[str] | None = None) -> list[Clip]:
@@ -235,6 +231,17 @@ def _check_joints(clip: Clip, robot: Robot, source: str | None = None) -> None:
             f"{robot.num_joints} (missing: {', '.join(missing[:3]) or 'none'}; "
             f"unknown: {', '.join(unknown[:3]) or 'none'})"
         )
+
+
+def _one_after_the_other(clips: Sequence[Frames], names: Sequence[str]) -> MotionLibrary:
+    """A library of clips [frame], given as numpy arrays."""
+    lengths = np.array([len(clip.joint_pos) for clip in clips])
+    return MotionLibrary(
+        frames=jax.tree.map(lambda *values: jnp.asarray(np.concatenate(values), jnp.float32), *clips),
+        start=jnp.asarray(np.cumsum(lengths) - lengths, jnp.int32),
+        length=jnp.asarray(lengths, jnp.int32),
+        names=tuple(names),
+    )
 
 
 def _frames(robot: Robot, clip: Clip) -> Frames:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
@@ -17,8 +16,7 @@ from forgetmimic_jax.robot.bodies import Bodies
 def lookup(library: MotionLibrary, clip: Array, frame: Array) -> Frames:
     """Frame `frame` [env] of clip `clip` [env]; past a clip's end its last frame, held at rest."""
     last = library.length[clip] - 1
-    reference = jax.tree.map(lambda values: values[clip, jnp.minimum(frame, last)], library.frames)
-    return _at_rest_where(frame > last, reference)
+    return _at_rest_where(frame > last, library.at(clip, frame))
 
 
 def _at_rest_where(mask: Array, reference: Frames) -> Frames:

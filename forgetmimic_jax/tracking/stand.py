@@ -33,7 +33,7 @@ def stand_library(robot: Robot, frames: int = 2, fps: float = 50.0) -> MotionLib
 
 def stand_frame(robot: Robot) -> Frames:
     """The stand as one frame, without a leading dimension: at the world's origin, heading along x."""
-    return jax.tree.map(lambda values: values[0, 0], stand_library(robot).frames)
+    return jax.tree.map(lambda values: values[0], stand_library(robot).frames)
 
 
 def low(robot: Robot, bodies: Bodies) -> Array:

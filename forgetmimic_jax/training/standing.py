@@ -5,13 +5,11 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 from rich.console import Console
 
 from forgetmimic_jax.basics.errors import InputError, Interrupted
 from forgetmimic_jax.evaluation.rollout import Evaluator
-from forgetmimic_jax.motion.library import MotionLibrary
+from forgetmimic_jax.motion.library import MotionLibrary, together
 from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.settings.config import UnlearnConfig, load_config
 from forgetmimic_jax.tracking.setup import Setup
@@ -75,7 +73,7 @@ def _learning(setup: Setup) -> Setup:
             unlearn=UnlearnConfig((STAND,), method="finetune"),
             sampling=dataclasses.replace(config.sampling, clips="all", target_share=0.5),
         ),
-        library=_together(setup.library, _stand(setup)),
+        library=together(setup.library, _stand(setup)),
         library_hash=f"{setup.library_hash}+{STAND}",
         instead=None,
     )
@@ -84,18 +82,3 @@ def _learning(setup: Setup) -> Setup:
 def _stand(setup: Setup) -> MotionLibrary:
     step = setup.config.physics.control_step
     return stand_library(setup.robot, frames=round(SECONDS / step) + 1, fps=1.0 / step)
-
-
-def _together(first: MotionLibrary, second: MotionLibrary) -> MotionLibrary:
-    """The clips of two libraries, the shorter one padded with its last frames."""
-    frames = max(library.frames.joint_pos.shape[1] for library in (first, second))
-
-    def padded(values: jax.Array) -> jax.Array:
-        width = [(0, 0), (0, frames - values.shape[1])] + [(0, 0)] * (values.ndim - 2)
-        return jnp.pad(values, width, mode="edge")
-
-    return MotionLibrary(
-        frames=jax.tree.map(lambda *values: jnp.concatenate([padded(v) for v in values]), first.frames, second.frames),
-        length=jnp.concatenate([first.length, second.length]),
-        names=first.names + second.names,
-    )

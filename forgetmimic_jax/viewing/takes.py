@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import jax
 import numpy as np
 
 from forgetmimic_jax.evaluation.metrics import BASE, ZERO_ACTION
@@ -81,10 +80,8 @@ def at(episode: Episode, policy: str, step: int) -> tuple[str, str]:
 
 def reference_qpos(robot: Robot, library: MotionLibrary, clip: int) -> np.ndarray:
     """A clip as configurations [frame, nq] of the robot."""
-    length = int(library.length[clip])
-    frames = jax.tree.map(lambda values: values[clip], library.frames)
-    parts = (frames.bodies.pos[:, robot.root], frames.bodies.quat[:, robot.root], frames.joint_pos)
-    return np.concatenate([np.asarray(part)[:length] for part in parts], axis=-1)
+    frames = library.clip(clip)
+    return np.concatenate([frames.bodies.pos[:, robot.root], frames.bodies.quat[:, robot.root], frames.joint_pos], -1)
 
 
 def record(

@@ -140,7 +140,7 @@ def test_every_policy_meets_the_same_starts_and_the_same_reset_noise(evaluator, 
     for other in others:
         for one, two in zip(jax.tree.leaves(first), jax.tree.leaves(other), strict=True):
             np.testing.assert_array_equal(one, two)
-    noise = first.physics.qpos[:, 7:] - np.asarray(library.frames.joint_pos)[evaluator.clip, evaluator.start_frame]
+    noise = first.physics.qpos[:, 7:] - library.at(evaluator.clip, evaluator.start_frame).joint_pos
     assert 0.09 < np.abs(noise).max() <= 0.1 + 1e-6  # rad
     assert len(np.unique(noise, axis=0)) == 2 * EPISODES  # episodes of one clip and frame too have each their own
 

@@ -46,22 +46,41 @@ def test_a_clip_survives_its_file_to_1e_5(clip, tmp_path):
         np.testing.assert_allclose(getattr(found, field), getattr(clip, field), atol=1.1e-5)
 
 
-def test_shorter_clips_are_padded_with_their_last_frame(robot, folder):
+def test_clips_stand_one_after_the_other(robot, folder):
     loaded = library.load_library(robot, folder)
     assert loaded.names == ("sway", "turn")
-    assert loaded.length.tolist() == [40, 25]
-    assert loaded.frames.joint_pos.shape == (2, 40, robot.num_joints)
-    assert loaded.frames.bodies.pos.shape == (2, 40, len(robot.key_bodies), 3)
-    for values in jax.tree.leaves(loaded.frames):
-        row = np.asarray(values)[1]
-        np.testing.assert_array_equal(row[25:], np.broadcast_to(row[24], row[25:].shape))
+    assert (loaded.start.tolist(), loaded.length.tolist()) == ([0, 40], [40, 25])
+    assert loaded.frames.joint_pos.shape == (65, robot.num_joints)
+    assert loaded.frames.bodies.pos.shape == (65, len(robot.key_bodies), 3)
+    for values, turn in zip(jax.tree.leaves(loaded.frames), jax.tree.leaves(loaded.clip(1)), strict=True):
+        np.testing.assert_array_equal(turn, values[40:])
+
+
+def test_past_a_clip_s_end_follows_its_last_frame_and_not_the_next_clip(robot, folder):
+    loaded = library.load_library(robot, folder)
+    clips, frames = np.array([0, 0, 0, 1, 1, 1]), np.array([3, 39, 41, 0, 24, 30])
+    shown = loaded.at(clips, frames)
+    for values, found in zip(jax.tree.leaves(loaded.frames), jax.tree.leaves(shown), strict=True):
+        np.testing.assert_array_equal(found, values[np.array([3, 39, 39, 40, 64, 64])])
+
+
+def test_libraries_come_together_clip_by_clip(robot, folder):
+    loaded = library.load_library(robot, folder)
+    both = library.together(library.only_clips(loaded, ["turn"]), loaded)
+    assert (both.names, both.start.tolist(), both.length.tolist()) == (
+        ("turn", "sway", "turn"),
+        [0, 25, 65],
+        [25, 40, 25],
+    )
+    for clip, of in enumerate((1, 0, 1)):
+        jax.tree.map(np.testing.assert_array_equal, both.clip(clip), loaded.clip(of))
 
 
 def test_no_velocity_is_taken_across_clips(robot, folder):
     """Alone or beside another clip, a clip's arrays are the same."""
     alone = library.load_library(robot, folder, ["turn"])
     beside = library.load_library(robot, folder)
-    np.testing.assert_array_equal(alone.frames.bodies.lin_vel[0], beside.frames.bodies.lin_vel[1, :25])
+    np.testing.assert_array_equal(alone.clip(0).bodies.lin_vel, beside.clip(1).bodies.lin_vel)
 
 
 def test_clips_are_loaded_in_the_order_asked_for(robot, folder):

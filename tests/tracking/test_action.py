@@ -64,7 +64,7 @@ def step(request, robot, library, tiny_config, mode):
 def origin(robot, library, mode):
     """Joint targets of the action 0, by name: of the next frame, or of the default pose."""
     if mode == "residual":
-        pose = np.asarray(library.frames.joint_pos)[CLIP, FRAME + 1]
+        pose = library.clip(CLIP).joint_pos[FRAME + 1]
         return dict(zip(robot.joint_names, pose, strict=True))
     knees_bent = {"hip_pitch": -0.312, "knee": 0.669, "ankle_pitch": -0.363, "shoulder_pitch": 0.2, "elbow": 0.6}
     pose = {f"{side}_{joint}_joint": angle for side in ("left", "right") for joint, angle in knees_bent.items()}

@@ -85,7 +85,7 @@ def follow(env: Environment, assets, state: EnvState, action=None):
 
 
 def rows(library, clip: list[int], frame: list[int], field: str) -> np.ndarray:
-    return np.asarray(attrgetter(field)(library.frames))[clip, frame]
+    return np.asarray(attrgetter(field)(library.at(np.array(clip), np.array(frame))))
 
 
 def test_a_step_moves_to_the_next_frame_and_remembers_the_action(puppet_env, assets):
@@ -262,10 +262,11 @@ def anchor_track(env: Environment, library, clip: list[int], frame: list[int]) -
     anchor, substeps = env.robot.anchor, env.config.physics.substeps
     ends = np.array([frame, np.array(frame) + 1])
     bodies = ("bodies.pos", "bodies.lin_vel", "bodies.ang_vel")
-    both = {name: np.asarray(attrgetter(name)(library.frames), np.float64)[clip, ends][:, :, anchor] for name in bodies}
+    shown = jax.tree.map(lambda values: np.asarray(values, np.float64), library.at(np.array(clip), ends))
+    both = {name: attrgetter(name)(shown)[:, :, anchor] for name in bodies}
     for name in ("anchor_lin_acc", "anchor_ang_acc"):
-        both[name] = np.asarray(attrgetter(name)(library.frames), np.float64)[clip, ends]
-    quat = np.asarray(library.frames.bodies.quat, np.float64)[clip, ends][:, :, anchor]
+        both[name] = attrgetter(name)(shown)
+    quat = shown.bodies.quat[:, :, anchor]
     track = []
     for part in np.arange(substeps) / substeps:
         now = {name: (1.0 - part) * values[0] + part * values[1] for name, values in both.items()}
@@ -344,9 +345,9 @@ def test_a_reference_of_constant_velocity_needs_the_weight_and_no_torque(robot, 
         }
 
     library = assets.library
-    frames = np.broadcast_to(np.arange(library.frames.joint_pos.shape[1]), library.frames.joint_pos.shape[:2])
+    frames = np.concatenate([np.arange(length) for length in library.length])
     bodies = library.frames.bodies
-    moved = {name: getattr(bodies, name).at[:, :, anchor].set(at(frames)[f"bodies.{name}"]) for name in vars(bodies)}
+    moved = {name: getattr(bodies, name).at[:, anchor].set(at(frames)[f"bodies.{name}"]) for name in vars(bodies)}
     none = jnp.zeros_like(library.frames.anchor_lin_acc)
     still = {"anchor_lin_acc": none, "anchor_ang_acc": none}
     inertia = jnp.diag(jnp.array([1.0, 2.0, 3.0]))

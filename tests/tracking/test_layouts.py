@@ -294,7 +294,7 @@ def observed(robot, library, tiny_config, layout):
 
 def test_the_reference_shown_is_the_next_frame(library, layout, observed):
     rows, (_, clean, *_) = [1, 8, 40], observed
-    frames = jax.tree.map(lambda values: np.asarray(values)[1, rows], library.frames)
+    frames = library.at(1, np.array(rows))
     pelvis, torso = 0, 7
     shown = {
         "ref_base_height": frames.bodies.pos[:, torso, 2:],
@@ -313,7 +313,7 @@ def test_the_anchors_terms_compare_the_robot_with_the_next_frame(library, layout
     _, clean, *_ = observed
     if "motion_anchor_ori_b" not in LAYOUTS[layout].places(29):
         return
-    quat, pos = (np.asarray(getattr(library.frames.bodies, name))[1, :, 7] for name in ("quat", "pos"))
+    quat, pos = (getattr(library.clip(1).bodies, name)[:, 7] for name in ("quat", "pos"))
     for row, frame in enumerate((0, 7, 39)):
         here, there = (Rotation.from_quat(quat[frame + ahead], scalar_first=True) for ahead in (0, 1))
         np.testing.assert_allclose(

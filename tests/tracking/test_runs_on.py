@@ -105,6 +105,6 @@ def test_a_robot_that_comes_apart_is_still_terminated(setup):
 def test_after_the_clip_s_end_the_last_frame_is_held(setup, library):
     """Frame 60 of `turn`, which has 41; the kept clip is at frame 60 of 80."""
     result = stepped(setup, lambda bodies: bodies, frame=60)
-    np.testing.assert_array_equal(result.pair.reference.joint_pos[TURN], library.frames.joint_pos[TURN, 40])
-    np.testing.assert_array_equal(result.pair.reference.joint_pos[SWAY], library.frames.joint_pos[SWAY, 61])
+    np.testing.assert_array_equal(result.pair.reference.joint_pos[TURN], library.clip(TURN).joint_pos[40])
+    np.testing.assert_array_equal(result.pair.reference.joint_pos[SWAY], library.clip(SWAY).joint_pos[61])
     assert not result.terminated.any()

@@ -115,7 +115,7 @@ def test_the_taught_action_sends_the_joint_targets_that_the_teacher_would(
     assets = dataclasses.replace(assets, teacher=SimpleNamespace(mean_action=lambda seen: jnp.asarray(action)[None]))
     found = np.asarray(taught_action(env, assets, started(env, assets, TURN, frame)))[0]
     default, scale = (np.asarray(x) for x in (robot.arrays.default_joint_pos, robot.arrays.action_scale))
-    reference = np.asarray(library.frames.joint_pos[TURN, min(frame + 1, 40)])
+    reference = library.clip(TURN).joint_pos[min(frame + 1, 40)]
     for joint, name in enumerate(robot.joint_names):
         place = list(names).index(name)
         target = default[joint] + scale[joint] * action[place]
@@ -129,7 +129,7 @@ def test_a_kept_clip_instead_is_shown_at_the_target_s_frame_and_held_with_it(rob
     env, assets = puppet(setup, None, None, []), make_assets(setup)
     for frame, shown in ((FRAME, FRAME + 1), (39, 40), (60, 40)):
         moment = teacher_moment(env, assets, started(env, assets, TURN, frame))
-        np.testing.assert_array_equal(moment.reference.joint_pos[0], library.frames.joint_pos[SWAY, shown])
+        np.testing.assert_array_equal(moment.reference.joint_pos[0], library.clip(SWAY).joint_pos[shown])
 
 
 def test_against_a_kept_clip_the_last_action_is_of_the_joint_targets_sent(robot, library, tiny_config):
@@ -138,7 +138,7 @@ def test_against_a_kept_clip_the_last_action_is_of_the_joint_targets_sent(robot,
     sent: list[np.ndarray] = []
     env, assets = puppet(setup, *leaning(robot, 0.0, (0.0, 0.0)), sent), make_assets(setup)
     after, _ = tracking.step(env, assets, started(env, assets, TURN, FRAME), jnp.full((1, 29), 0.5), KEY)
-    turn, sway = (np.asarray(library.frames.joint_pos[clip, FRAME + 1]) for clip in (TURN, SWAY))
+    turn, sway = (library.clip(clip).joint_pos[FRAME + 1] for clip in (TURN, SWAY))
     scale = np.asarray(robot.arrays.action_scale)
     np.testing.assert_allclose(sent[0][0], turn + 0.5 * scale, atol=1e-6)
     found = teacher_moment(env, assets, after).last_action[0]
