@@ -48,17 +48,24 @@ def base_checkpoint(config: Config) -> Path:
 
 
 def with_interface_of_base(config: Config) -> Config:
-    """The config with the observations and actions of the base that training continues from, if it names one.
+    """The config with the interface of the base that training continues from, if it names one.
 
     A run's folder becomes the checkpoint that it stands for now.
-
-    Of another robot's base only the action's mode is taken: its tables are of other joints.
     """
     if config.base is None:
         return config
     info = checkpoint.read_info(Path(config.base))
-    action = info.config.action if info.robot == config.robot else ActionConfig(mode=info.config.action.mode)
-    return dataclasses.replace(config, base=str(info.path), observation=info.config.observation, action=action)
+    return dataclasses.replace(with_interface(config, info.config), base=str(info.path))
+
+
+def with_interface(config: Config, base: Config) -> Config:
+    """The config with what a base expects: its observations, its actions, and whether the robot's bodies collide.
+
+    Of another robot's base only the action's mode is taken: its tables are of other joints.
+    """
+    action = base.action if base.robot == config.robot else ActionConfig(mode=base.action.mode)
+    physics = dataclasses.replace(config.physics, self_collision=base.physics.self_collision)
+    return dataclasses.replace(config, observation=base.observation, action=action, physics=physics)
 
 
 def unlearned_base(config: Config) -> str | None:

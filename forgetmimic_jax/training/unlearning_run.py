@@ -118,13 +118,13 @@ def config_of_new_run(options: Options) -> Config:
 
 
 def _on_preset(base: Config, name: str) -> Config:
-    """A preset's settings with what the base's policy brings: its observations, actions, network, bins and clips."""
-    config = preset(name)
+    """A preset's settings with what the base's policy brings: its interface, network, bins and clips."""
+    from forgetmimic_jax.training.start import with_interface
+
+    config = with_interface(dataclasses.replace(preset(name), robot=base.robot), base)
     return dataclasses.replace(
         config,
         library=base.library,
-        observation=base.observation,
-        action=base.action,
         sampling=dataclasses.replace(config.sampling, bin_seconds=base.sampling.bin_seconds),
         ppo=dataclasses.replace(config.ppo, actor_layers=base.ppo.actor_layers, critic_layers=base.ppo.critic_layers),
     )
