@@ -71,6 +71,7 @@ class GroupResult(msgspec.Struct, kw_only=True, omit_defaults=True):
     survival_weighted_tracking: Estimate
     success_rate: Estimate
     episode_length: Estimate
+    success_rate_from_frame_0: Estimate | None = None  # of the episodes that start there; absent in older files
     skill: Estimate | None = None  # signed; None where the base is hardly better than the zero-action baseline
     retention: Estimate | None = None
     unbounded: UnboundedResult | None = None  # of targets; absent in older files

@@ -43,12 +43,13 @@ def evaluate_policies(
         policy: metrics.episode_metrics(rollout, common if len(rollouts) > 1 else None)
         for policy, rollout in rollouts.items()
     }
-    clip = next(iter(rollouts.values())).clip
+    first = next(iter(rollouts.values()))
+    clip, from_frame_0 = first.clip, first.start_frame == 0
     weights = statistics.resampling_weights(clip, seed=seed, resamples=resamples)
     is_target = np.isin(clip, [names.index(target) for target in targets])
     return {
         policy: policy_result(
-            _policy_summary(policy, per_policy, clip, is_target, names, weights)
+            _policy_summary(policy, per_policy, clip, is_target, from_frame_0, names, weights)
             | {"nan_resets": int(rollout.nan_resets)}
             | {"ended_by": {bound: int(episodes.sum()) for bound, episodes in rollout.ended_by.items()}}
         )
@@ -61,6 +62,7 @@ def _policy_summary(
     per_policy: Mapping[str, Mapping[str, np.ndarray]],
     clip: np.ndarray,
     is_target: np.ndarray,
+    from_frame_0: np.ndarray,
     names: Sequence[str],
     weights: np.ndarray,
 ) -> dict[str, Any]:
@@ -68,12 +70,13 @@ def _policy_summary(
     for index in np.unique(clip):
         members = clip == index
         target = bool(is_target[members][0])
-        clips[names[index]] = {"target": target, **_episodes_summary(policy, per_policy, members, weights)}
+        numbers = _episodes_summary(policy, per_policy, members, from_frame_0, weights)
+        clips[names[index]] = {"target": target, **numbers}
     summary: dict[str, Any] = {"clips": clips}
     if is_target.any():
-        summary["target"] = _episodes_summary(policy, per_policy, is_target, weights)
+        summary["target"] = _episodes_summary(policy, per_policy, is_target, from_frame_0, weights)
     if not is_target.all():
-        summary["kept"] = _episodes_summary(policy, per_policy, ~is_target, weights)
+        summary["kept"] = _episodes_summary(policy, per_policy, ~is_target, from_frame_0, weights)
     if is_target.any() and not is_target.all():
         for name, metric in (
             ("degradation_ratio", "tracking_reward"),  # the paper's
@@ -89,6 +92,7 @@ def _episodes_summary(
     policy: str,
     per_policy: Mapping[str, Mapping[str, np.ndarray]],
     members: np.ndarray,
+    from_frame_0: np.ndarray,
     weights: np.ndarray,
 ) -> dict[str, Estimate]:
     """Every metric of one policy over the episodes bool[E] of whole clips."""
@@ -100,6 +104,9 @@ def _episodes_summary(
     }
     success = per_policy[policy]["success_rate"][members]
     summary["success_rate"] = statistics.rate(int(success.sum()), len(success))
+    if (members & from_frame_0).any():
+        first = success[from_frame_0[members]]
+        summary["success_rate_from_frame_0"] = statistics.rate(int(first.sum()), len(first))
     if policy in (BASE, ZERO_ACTION) or BASE not in per_policy:
         return summary
 

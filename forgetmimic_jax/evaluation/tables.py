@@ -204,6 +204,7 @@ def _group_rows(document: EvaluationDocument, *, digits: int = 3) -> Rows:
         groups = [getattr(policy, name) for policy in policies]
         for label, metric, show in (
             ("success", "success_rate", percent),
+            ("success, from frame 0", "success_rate_from_frame_0", percent),
             ("tracking", "survival_weighted_tracking", number),
             ("while alive", "tracking_reward", number),
             ("skill", "skill", percent),

@@ -1,3 +1,4 @@
+import dataclasses
 import io
 import json
 from pathlib import Path
@@ -109,6 +110,16 @@ def test_without_targets_everything_is_kept(rollouts):
     base = policies["base"]
     assert (base.target, base.degradation_ratio) == (None, None)
     assert list(base.kept.errors) == ["mpkpe"]  # nothing to have steps in common with
+
+
+def test_success_from_frame_0_counts_the_episodes_that_start_there(make_rollout):
+    """Of punch: one of two from frame 0 and one of one from later on; of walk: none starts at frame 0."""
+    rollout = make_rollout([0, 0, 1, 1, 1], [10] * 5, [10, 10, 10, 4, 10], [1.0] * 5)
+    rollout = dataclasses.replace(rollout, start_frame=np.array([7, 5, 0, 0, 6]))
+    base = evaluate_policies({"base": rollout}, ["walk", "punch"], ["punch"], seed=0)["base"]
+    assert base.clips["walk"].success_rate_from_frame_0 is None
+    found = base.target.success_rate_from_frame_0
+    assert (found.mean, found.n, base.target.success_rate.n) == (0.5, 2, 3)
 
 
 def test_an_unknown_target_names_the_nearest_clip(rollouts):
