@@ -14,13 +14,14 @@
 ## BESIDE       more checkpoints to play or film beside it, comma-separated
 ## RUN          folder of the run to attack, or to report on
 ## OUTPUT       where the results go (default: under runs/)
+## NOISE        1 evaluates with randomisation, pushes and sensor noise
 ## RESUME       1 continues the run in OUTPUT
 ## SWEEP        lambda, targets, sampler or seeds (default: lambda)
 ## CLUSTER      address of a dask scheduler whose workers run the trials of sweep and experiments (default: none)
 ## ARGS         flags as they are, and what comes before them; ARGS=--help lists all flags
 ## PYTHON       the Python that .venv is made from, 3.11 to 3.14 (default: the first found)
 PROGRAM = .venv/bin/python -m forgetmimic_jax
-SWITCHES = RESUME WRENCH DRAW DRY FORCE MIX_COMMITS NO_STOP FULL FAKES
+SWITCHES = RESUME NOISE WRENCH DRAW DRY FORCE MIX_COMMITS NO_STOP FULL FAKES
 
 # The variables of the command line as flags; a switch has no value.
 given = $(foreach name,$(.VARIABLES),$(if $(filter command,$(origin $(name))),$(name)))

@@ -30,12 +30,15 @@ class Options:
     """Episodes a clip: half from frame 0, half spread over the clip."""
     seed: int = 0
     """Seed of start frames and reset noise; the same for every policy."""
+    noise: bool = False
+    """Evaluate with the randomisation, the pushes and the sensor noise of training."""
     physics: EngineName | None = None
     """Physics engine; auto is native on a CPU and mjx on a GPU or TPU."""
     library: Path | None = None
     """Folder of clips, which may be other ones than the checkpoint's; the checkpoint's by default."""
     output: Path | None = None
-    """Folder for evaluation.json, .md and .png; beside the checkpoints of the run, or runs/evaluate-ROBOT."""
+    """Folder for evaluation.json, .md and .png; beside the checkpoints of the run, or runs/evaluate-ROBOT. An
+    evaluation with noise has the folder `noise` there."""
 
 
 def main(options: Options) -> None:
@@ -51,6 +54,7 @@ def main(options: Options) -> None:
     at_least(0, "--seed", options.seed)
     path = options.checkpoint or base_folder(options.robot)
     output = options.output or folder_of(path) or Path("runs") / f"evaluate-{options.robot}"
+    output = output / "noise" if options.noise and options.output is None else output
     check_writable(output)
     compared = load_comparison(
         path,
@@ -68,6 +72,7 @@ def main(options: Options) -> None:
         targets=compared.targets,
         episodes=options.episodes,
         seed=options.seed,
+        noise=options.noise,
     )
     closing(show_and_write(output, document), _next(options, compared))
 

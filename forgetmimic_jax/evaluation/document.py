@@ -111,6 +111,7 @@ class EvaluationDocument(msgspec.Struct, kw_only=True, omit_defaults=True):
     seed: int  # of the start frames, the resets and the bootstrap
     episodes: int  # a clip
     targets: list[str]  # clips to forget
+    noise: bool = False  # randomisation, pushes and sensor noise as in training
     policies: dict[str, PolicyResult]  # by name: base, unlearned, zero_action ...
     budget: dict[str, dict[str, int | float]] = {}  # by policy, what its training cost
     made: Provenance | None = None  # absent in older files, as are the hashes

@@ -35,6 +35,7 @@ def evaluate(
     targets: tuple[str, ...],
     episodes: int,
     seed: int,
+    noise: bool = False,
 ) -> EvaluationDocument:
     """The evaluation of policies and of the zero-action baseline on the same episodes; see `rollout`, `unbounded`.
 
@@ -44,9 +45,10 @@ def evaluate(
         checkpoint: what is evaluated, as the user named it.
         targets: clips to forget.
         episodes: a clip.
-        seed: of the start frames, the resets and the bootstrap.
+        seed: of the start frames, the resets, the noise and the bootstrap.
+        noise: with the randomisation, the pushes and the sensor noise of training; then every episode has its bounds.
     """
-    evaluator = Evaluator(setup, episodes=episodes, seed=seed)
+    evaluator = Evaluator(setup, episodes=episodes, seed=seed, noise=noise)
     rollouts = {}
     everyone: dict[str, Policy | None] = {name: subject.policy for name, subject in subjects.items()}
     everyone[ZERO_ACTION] = None
@@ -55,7 +57,7 @@ def evaluate(
             rollouts[name] = evaluator.rollout(policy)
             report(done, sum(int(rollout.length.sum()) for rollout in rollouts.values()), {})
     policies = evaluate_policies(rollouts, setup.library.names, targets, seed=seed)
-    if targets:
+    if targets and not noise:
         instead = unbounded.roll_out(setup, everyone, targets, episodes=episodes, seed=seed)
         unbounded.add_numbers(policies, instead, setup.library.names, seed=seed)
     return EvaluationDocument(
@@ -66,6 +68,7 @@ def evaluate(
         library_hash=setup.library_hash,
         seed=seed,
         episodes=episodes,
+        noise=noise,
         targets=list(targets),
         policies=policies,
         budget={name: {"environment_steps": subject.environment_steps} for name, subject in subjects.items()},

@@ -1,6 +1,7 @@
 """The evaluation protocol: deterministic actions, no wrench, no randomisation, the clip pinned, no roll-over.
 
-Start frames and reset noise depend on the seed alone, so that every policy meets the same episodes.
+With `noise`, randomisation, pushes and sensor noise are as in training. All that is random depends on the seed alone,
+so that every policy meets the same episodes.
 """
 
 from __future__ import annotations
@@ -38,12 +39,12 @@ class Acting(Protocol):
 class Evaluator:
     """Rolls policies out on the same episodes of one library. Compiled once, used for any number of policies."""
 
-    def __init__(self, setup: Setup, *, episodes: int, seed: int):
+    def __init__(self, setup: Setup, *, episodes: int, seed: int, noise: bool = False):
         setup = evaluation_setup(setup)
         self.config = setup.config
         self.clip, self.start_frame = episode_starts(np.asarray(setup.library.length), episodes, seed)
         self._seed = seed
-        self._env = tracking.make_environment(setup, len(self.clip), noisy=False)
+        self._env = tracking.make_environment(setup, len(self.clip), noisy=noise)
         self._assets = tracking.make_assets(setup)
         self._begin = jax.jit(self._begin_episodes)
         self._advance = jax.jit(self._advance_chunk)
@@ -63,7 +64,7 @@ class Evaluator:
         ended_by: dict[str, np.ndarray] = {}
         records = []
         for begin in range(0, int(horizon.max()), CHUNK):
-            state, record = jax.device_get(self._advance(self._assets, policy, state))
+            state, record = jax.device_get(self._advance(self._assets, policy, state, begin))
             terminated, blew_up, broken = (record.pop(name) for name in ("terminated", "diverged", "causes"))
             records.append(record)
             for offset in range(CHUNK):
@@ -95,12 +96,13 @@ class Evaluator:
         state = begin_episodes(self._env, assets, key, jnp.asarray(self.clip), jnp.asarray(self.start_frame))
         return tracking.refresh_bodies(self._env, state, jnp.ones((self._env.num_envs,), bool))
 
-    def _advance_chunk(self, assets: Assets, policy: Acting | None, state: EnvState):
+    def _advance_chunk(self, assets: Assets, policy: Acting | None, state: EnvState, begin: Array):
         env = self._env
 
         def one_step(state: EnvState, key: Array):
-            action = act(env, policy, tracking.observe(env, assets, state, None)[0])
-            state, result = tracking.step(env, assets, state, action, key)
+            sensor_key, push_key = jax.random.split(key)
+            observation, _ = tracking.observe(env, assets, state, sensor_key if env.noisy else None)
+            state, result = tracking.step(env, assets, state, act(env, policy, observation), push_key)
             record: dict[str, Any] = dict(step_errors(env.robot, result.pair))
             record |= {
                 "tracking_reward": result.reward.normalized_tracking,
@@ -110,7 +112,8 @@ class Evaluator:
             }
             return state, record
 
-        return jax.lax.scan(one_step, state, jax.random.split(jax.random.PRNGKey(0), CHUNK))
+        key = jax.random.fold_in(jax.random.PRNGKey(self._seed), begin)
+        return jax.lax.scan(one_step, state, jax.random.split(key, CHUNK))
 
 
 def begin_episodes(env: Environment, assets: Assets, key: Array, clip: Array, frame: Array) -> EnvState:

@@ -255,10 +255,11 @@ def _error_rows(document: EvaluationDocument) -> Rows:
 
 
 def _conditions(document: EvaluationDocument) -> list[str]:
+    noise = "randomisation, pushes and sensor noise as in training" if document.noise else "no noise but the resets'"
     return [
         f"- {_budget(document)}",
         f"- Checkpoint `{document.checkpoint}`, settings `{document.config_hash}`, library `{document.library_hash}`.",
-        "- Deterministic actions, wrench and randomisation off; every policy meets the same start frames and resets.",
+        f"- Deterministic actions, no wrench, {noise}; every policy meets the same start frames and resets.",
         "- In square brackets: the 95 % interval, by bootstrap over episodes stratified by clip; exact "
         "(Clopper-Pearson) for success. It covers this checkpoint's episodes, not other training seeds.",
     ]

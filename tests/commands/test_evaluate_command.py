@@ -65,6 +65,19 @@ def test_it_ends_with_the_files_and_what_to_do_next(evaluated_again):
     assert printed[-1].startswith("Next: make play ROBOT=g1 CHECKPOINT=")
 
 
+def test_with_noise_the_files_say_so_and_go_into_a_folder_of_their_own(unlearned_run):
+    options = evaluate.Options(checkpoint=unlearned_run.checkpoint(2), episodes=2, noise=True)
+    finished(evaluate.main, options)
+    folder = unlearned_run.folder / "noise"
+    document = read_evaluation(folder / "evaluation.json")
+    assert document.noise
+    assert all(policy.target.unbounded is None for policy in document.policies.values())
+    text = (folder / "evaluation.md").read_text()
+    assert "no wrench, randomisation, pushes and sensor noise as in training;" in text
+    assert not read_evaluation(unlearned_run.folder / "evaluation.json").noise
+    shutil.rmtree(folder)
+
+
 def test_a_base_that_was_replaced_since_is_told_unless_it_was_named(refused, unlearned_run, base_run, tmp_path):
     copy = Path(shutil.copytree(unlearned_run.checkpoint(2), tmp_path / "copy"))
     meta = json.loads((copy / "meta.json").read_text())

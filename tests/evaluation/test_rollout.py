@@ -14,6 +14,7 @@ from forgetmimic_jax.tracking.env import EnvState
 from forgetmimic_jax.tracking.layouts import LAYOUTS
 from forgetmimic_jax.tracking.reference import align_to_anchor, lookup
 from forgetmimic_jax.tracking.reward import Pair
+from forgetmimic_jax.tracking.setup import Setup
 
 EPISODES = 4  # a clip; the library has two
 
@@ -124,7 +125,7 @@ def start_of(evaluator: Evaluator, policy: Policy | None) -> EnvState:
     """The state in which the rollout of a policy begins; it ends right there."""
     states = []
 
-    def advance(assets, policy, state):
+    def advance(assets, policy, state, begin):
         states.append(jax.device_get(state))
         ended = np.ones((CHUNK, 2 * EPISODES), bool)
         return state, {"tracking_reward": np.zeros(ended.shape), "terminated": ended, "diverged": ~ended, "causes": {}}
@@ -145,6 +146,34 @@ def test_every_policy_meets_the_same_starts_and_the_same_reset_noise(evaluator, 
     assert len(np.unique(noise, axis=0)) == 2 * EPISODES  # episodes of one clip and frame too have each their own
 
 
+def noisy(setup: Setup, **settings) -> Evaluator:
+    """With the noise of these settings alone."""
+    still = dict.fromkeys(("encoder_bias", "sensors"), 0.0) | {
+        "torso_com": (0.0, 0.0, 0.0),
+        "push_interval": (9.0, 9.0),
+    }
+    noise = dataclasses.replace(setup.config.noise, **still | {"foot_friction": (0.6, 0.6)} | settings)
+    config = dataclasses.replace(setup.config, noise=noise)
+    return Evaluator(dataclasses.replace(setup, config=config), episodes=EPISODES, seed=0, noise=True)
+
+
+def test_with_noise_every_robot_is_another_one(tiny_setup):
+    friction = np.asarray(noisy(tiny_setup, foot_friction=(0.3, 1.5)).start().parameters.foot_friction)
+    assert len(np.unique(friction)) == 2 * EPISODES
+
+
+def test_with_noise_robots_are_pushed_and_every_policy_alike(tiny_setup):
+    pushed, still = noisy(tiny_setup, push_interval=(0.02, 0.02)), noisy(tiny_setup)
+    first, again = pushed.rollout(None), pushed.rollout(None)
+    np.testing.assert_array_equal(first.tracking_reward, again.tracking_reward)
+    assert (np.abs(first.tracking_reward - still.rollout(None).tracking_reward)[:, 4] > 0.01).all()
+
+
+def test_with_noise_a_policy_reads_its_sensors_wrongly(tiny_setup, policy):
+    misread, read = (noisy(tiny_setup, sensors=sensors).rollout(policy).tracking_reward for sensors in (1.0, 0.0))
+    assert (misread[:, 0] != read[:, 0]).all()
+
+
 def test_a_policy_changes_the_robot_only_after_its_first_action(evaluator, echo):
     """Two policies that agree in their first action and part in the second, beside one that never acts."""
     still, steady, rising = (evaluator.rollout(echo(*policy)) for policy in ((0.0, 0.0), (0.2, 0.0), (0.2, 1.0)))
@@ -156,12 +185,10 @@ def test_a_policy_changes_the_robot_only_after_its_first_action(evaluator, echo)
 
 def scripted(evaluator: Evaluator, terminated: dict[int, list[int]], diverged: dict[int, list[int]]):
     """A rollout in which environment `e` breaks a bound, or blows up, at the steps listed; r̄ is the step's number."""
-    envs, chunk = 2 * EPISODES, 0
+    envs = 2 * EPISODES
 
-    def advance(assets, policy, state):
-        nonlocal chunk
-        steps = np.arange(CHUNK) + CHUNK * chunk
-        chunk += 1
+    def advance(assets, policy, state, begin):
+        steps = begin + np.arange(CHUNK)
 
         def marks(events: dict[int, list[int]]) -> np.ndarray:
             return np.stack([np.isin(steps, events.get(env, [])) for env in range(envs)], axis=1)
