@@ -18,6 +18,9 @@ from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.physics.mjx import WARP_CONSTRAINTS, WARP_CONTACTS, MjxEngine
 from forgetmimic_jax.robot.model import load_robot
 from forgetmimic_jax.settings.config import PhysicsConfig
+from forgetmimic_jax.tracking.layouts import LAYOUTS, Moment
+from forgetmimic_jax.tracking.observation import actor_observation
+from forgetmimic_jax.tracking.stand import stand_frame
 
 HANG = 600  # s: far above any compilation here
 # Half the compilation, the same program.
@@ -185,3 +188,18 @@ def test_warp_step_equals_the_native_engines(robot, inputs, native_result):
     for part, expected in zip(result, native_result, strict=True):
         for name, values in vars(part).items():
             assert_close(name, values, getattr(expected, name))
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_a_policy_of_any_layout_sees_the_same_with_both_engines(robot, result, native_result, name):
+    """Each robot after its step, whose reference is a robot that stands at rest."""
+    still = jax.tree.map(lambda values: jnp.broadcast_to(values, (len(CASES), *values.shape)), stand_frame(robot))
+    nothing = jnp.zeros((len(CASES), robot.num_joints))
+
+    def seen(physics, bodies):
+        moment = Moment(robot.arrays, still, physics, bodies, nothing, robot.anchor, robot.root)
+        return actor_observation(LAYOUTS[name], robot.policy_joints, moment)
+
+    found, expected = (np.asarray(seen(*outcome)) for outcome in (result, native_result))
+    assert found.shape == (len(CASES), LAYOUTS[name].size(robot.num_joints))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=TOLERANCE["ang_vel"])
