@@ -29,7 +29,8 @@ class Options:
     run: Path
     """Folder of the run."""
     control: Path | None = None
-    """Run of METHOD=distill or retrain with the same base and targets; RUN-control, which is made if it is missing."""
+    """Run of METHOD=distill or retrain with the same base and targets, or of `make pretrain WITHOUT=TARGETS`;
+    RUN-control by default, which is distilled if it is missing."""
     base: Path | None = None
     """Checkpoint that the run started from; the one its settings name by default."""
     full: bool = False

@@ -9,8 +9,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from forgetmimic_jax.basics.errors import InputError, run_command
-from forgetmimic_jax.settings.config import Config, EngineName, Preset
-from forgetmimic_jax.settings.options import Settings, check_same, on_engine, override, parse, replace_given
+from forgetmimic_jax.settings.config import Config, EngineName, Preset, UnlearnConfig
+from forgetmimic_jax.settings.options import (
+    Settings,
+    check_same,
+    comma_separated,
+    on_engine,
+    override,
+    parse,
+    replace_given,
+)
 
 if TYPE_CHECKING:
     from forgetmimic_jax.tracking.setup import Setup
@@ -47,8 +55,11 @@ class Options:
     base: Path | None = None
     """Checkpoint whose policy to start from, another robot's too; none: a random policy. By default the shipped base
     for a library of your own, and a random policy for the shipped library."""
+    without: str | None = None
+    """Clips to leave out, comma-separated: from a random policy, without an episode of these clips. The result is the
+    retrained control of a run that forgets them (evidence, report and the studies: --control)."""
     output: Path | None = None
-    """Folder of the run; runs/pretrain-ROBOT by default."""
+    """Folder of the run; runs/pretrain-ROBOT by default, or with --without runs/pretrain-ROBOT-control."""
     resume: bool = False
     """Continue from the newest checkpoint in the output folder, with the settings saved there."""
     set: Settings = field(default_factory=list)
@@ -63,7 +74,7 @@ def main(options: Options) -> None:
     from forgetmimic_jax.training.pretraining import Pretraining
     from forgetmimic_jax.training.run import run
 
-    output = options.output or Path("runs") / f"pretrain-{options.robot}"
+    output = options.output or Path("runs") / f"pretrain-{options.robot}{'-control' if options.without else ''}"
     prepare_folder(output, resume=options.resume)
     config = config_of(options, output)
     setup = make_setup(config)
@@ -84,16 +95,24 @@ def config_of(options: Options, output: Path) -> Config:
     """
     from forgetmimic_jax.settings.config import load_config, preset
     from forgetmimic_jax.training.start import shipped_base, with_interface_of_base
+    from forgetmimic_jax.unlearning.registry import unlearning_config
 
+    without = comma_separated(options.without or "")
+    options = dataclasses.replace(options, without=",".join(without) or None)
     if options.resume:
         config = load_config(output / "config.yaml")
         check_same(options, {name: getattr(config, name) for name in ("robot", "preset", "seed", "library", "base")})
+        check_same(options, {"without": ",".join(config.unlearn.targets)})
     else:
-        base = options.base or (shipped_base(options.robot) if options.library else None)
+        base = options.base or (shipped_base(options.robot) if options.library and not without else None)
         base = None if str(base) == "none" else base
+        if base and without:
+            raise InputError(f"--base: found {base} with --without; accepted: none, since a base may know those clips")
         config = dataclasses.replace(preset(options.preset), **LENGTH[options.preset], evaluate_episodes=EPISODES)
         config = replace_given(config, robot=options.robot, seed=options.seed, library=options.library, base=base)
         config = with_interface_of_base(config)
+        if without:
+            config = unlearning_config(config, UnlearnConfig(without, "retrain"))
     config = override(replace_given(config, iterations=options.iterations), itertools.chain(*options.set))
     every, save = config.evaluate_every, config.checkpoint_every
     if not every or every % save:

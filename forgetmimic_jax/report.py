@@ -28,7 +28,8 @@ class Options:
     base: Path | None = None
     """Checkpoint that the run started from; the one its settings name by default."""
     control: Path | None = None
-    """Run of `make unlearn METHOD=distill` (or retrain) with the same base, targets and evaluation, to compare with."""
+    """Run to compare with, of the same base, targets and evaluation: of `make unlearn METHOD=distill` or retrain, or
+    of `make pretrain WITHOUT=TARGETS`, evaluated with that base."""
     relearning: Path | None = None
     """JSON of experiments/relearning.py with policies trained as this run was: how fast they and a control relearn."""
     films: int = 4

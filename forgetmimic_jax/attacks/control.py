@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.evaluation.document import FILE
 from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.training import checkpoint
-from forgetmimic_jax.training.checkpoint import CheckpointInfo, newest_checkpoint
+from forgetmimic_jax.training.checkpoint import CheckpointInfo
 from forgetmimic_jax.unlearning.registry import methods
 
 METHOD = "distill"  # unless the user names a run
@@ -25,31 +26,41 @@ def is_finished(run: Path) -> bool:
 
 
 def read_control(run: Path, subject: CheckpointInfo, setup: Setup) -> CheckpointInfo:
-    """The last checkpoint of a control.
+    """What the policy of a control says of itself.
 
     Args:
-        run: its folder.
+        run: its folder, or that of its policy alone.
         subject: the unlearned policy.
         setup: of the unlearned policy.
 
     Raises:
-        InputError: no run, or one that is no control of this policy.
+        InputError: no policy, or one that is no control of the unlearned one.
     """
-    newest = newest_checkpoint(run)
-    if newest is None:
-        raise InputError(f"{run}: no run with a checkpoint; name one of METHOD=distill or retrain, or leave it out")
-    info = checkpoint.read_info(newest)
-    fresh = [name for name, of in methods().items() if of.start != "base"]
-    unlearn, sampling = info.config.unlearn, info.config.sampling
-    if unlearn.method not in fresh or not unlearn.targets:
-        raise InputError(f"{run}: unlearn.method: found {unlearn.method}, no control; accepted: {', '.join(fresh)}")
-    if sampling.clips != "kept":
-        raise InputError(f"{run}: sampling.clips: found {sampling.clips}, so it rolled out the targets; accepted: kept")
-    for field, found, ours in (
-        ("targets", sorted(unlearn.targets), sorted(subject.config.unlearn.targets)),
-        ("base", info.base, subject.base),
-    ):
-        if found != ours:
-            raise InputError(f"{run}: {field}: found {found}; accepted: {ours}, as in the unlearned run")
+    if not run.is_dir():
+        raise InputError(f"{run}: no such folder; name a run of METHOD=distill, retrain or pretrain, or leave it out")
+    info = checkpoint.read_info(run)
+    check_never_rolled_out(info, subject.config.unlearn.targets)
+    if info.base not in (None, subject.base):
+        raise InputError(f"{run}: base: found {info.base}; accepted: {subject.base}, as in the unlearned run")
     checkpoint.check_matches(info, setup)
     return info
+
+
+def check_never_rolled_out(info: CheckpointInfo, targets: Sequence[str]) -> None:
+    """InputError unless a policy was trained from a fresh one on all clips but the targets.
+
+    Args:
+        info: of the policy's checkpoint.
+        targets: names of clips.
+    """
+    fresh = [name for name, of in methods().items() if of.start != "base"]
+    unlearn, sampling = info.config.unlearn, info.config.sampling
+    for name, found, accepted in (
+        ("unlearn.method", unlearn.method if unlearn.targets else "none", fresh),
+        ("sampling.clips", sampling.clips, ["kept"]),
+        ("unlearn.targets", sorted(unlearn.targets), [sorted(targets)]),
+    ):
+        if found not in accepted:
+            raise InputError(
+                f"{info.path}: {name}: found {found}; accepted for a control: {' or '.join(map(str, accepted))}"
+            )

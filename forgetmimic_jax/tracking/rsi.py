@@ -68,11 +68,11 @@ def bin_probabilities(
     uniform_bins: 1/N_valid. uniform_clips: a clip uniformly, then a frame uniformly.
 
     With `target_share` the clips of is_target (bool[clip]) get that share of it all, and the others the rest. With
-    `starts` every clip gets its share [clip], and the rule decides among its bins alone.
+    `starts` every clip gets its share [clip], and the rule decides among its bins alone; a clip without one gets none.
     """
     probabilities = _by_rule(config, bins, failure_level)
     if starts is not None:
-        return starts[:, None] * probabilities / probabilities.sum(-1, keepdims=True)
+        return starts[:, None] * probabilities / jnp.maximum(probabilities.sum(-1, keepdims=True), 1e-12)
     if not config.target_share or is_target is None:
         return probabilities
     targets, kept = probabilities * is_target[:, None], probabilities * ~is_target[:, None]

@@ -5,6 +5,9 @@ ends with the same bits: what stood between its newest checkpoint and the kill i
 besides what every run has:
 
 policies/NUMBER   the policies that the curriculum may still need, by the number of their evaluation
+
+Clips that the training leaves out (the targets of a retrained control) are evaluated too, but the curriculum does not
+know them and no episode starts from them.
 """
 
 from __future__ import annotations
@@ -56,8 +59,8 @@ class Pretraining:
         self, setup: Setup, env: Environment, directory: Path, console: Console, resumed: CheckpointInfo | None
     ):
         self._setup, self._env, self._directory, self._console = setup, env, directory, console
-        self._names = setup.library.names
-        self._curriculum = Curriculum({name: ClipProgress() for name in self._names})
+        self._names, left_out = setup.library.names, setup.config.unlearn.targets
+        self._curriculum = Curriculum({name: ClipProgress() for name in self._names if name not in left_out})
         if resumed is not None:
             self._curriculum = msgspec.convert(resumed.curriculum, Curriculum)
         self._plain_assets = make_assets(setup)
@@ -108,11 +111,12 @@ class Pretraining:
         found = {
             name: Measured(of["success_rate"], of["survival_weighted_tracking"], of["episode_length"])
             for name, of in row["clips"].items()
+            if name in now.clips
         }
         self._curriculum = advance(self._config, now, found, position.iteration)
         specialist = {"specialist": now.specialist} if now.specialist else {}
         states = self._curriculum.states(self._config.pretrain)
-        clips = {name: of | {"state": states[name]} for name, of in row["clips"].items()}
+        clips = {name: of | ({"state": states[name]} if name in states else {}) for name, of in row["clips"].items()}
         self._watch.add({**row, "phase": now.phase, **specialist, "clips": clips})
         best = self._curriculum.best
         if best is not None and best.number == self._curriculum.number:
@@ -154,14 +158,23 @@ class Pretraining:
         """
         settings, best = settings_of(self._config, self._curriculum), self._curriculum.best
         focus = Focus(
-            starts=jnp.asarray(settings.starts, jnp.float32),
-            base_kl=jnp.asarray(settings.best_kl, jnp.float32),
+            starts=self._by_clip(settings.starts),
+            base_kl=self._by_clip(settings.best_kl),
             target_kl=jnp.float32(settings.target_kl),
             gae_lambda=jnp.float32(settings.gae_lambda),
         )
         # A copy, since an iteration donates the state that the policy is in.
         base = self._load(best) if any(settings.best_kl) and best is not None else jax.tree.map(jnp.copy, policy)
         return dataclasses.replace(self._plain_assets, focus=focus, base=base)
+
+    def _by_clip(self, values: tuple[float, ...]) -> jax.Array:
+        """Values of the curriculum's clips as f32[clip] of the library; 0 for a clip that is left out."""
+        of = dict(zip(self._curriculum.clips, values, strict=True))
+        return jnp.asarray([of.get(name, 0.0) for name in self._names], jnp.float32)
+
+    def _indices(self, *without: str) -> list[int]:
+        """The curriculum's clips in the library, but for some."""
+        return [self._names.index(name) for name in self._curriculum.clips if name not in without]
 
     def _first_success(self, policy: Policy, clip: str, key: jax.Array) -> tuple[Policy, int]:
         """The policy after regression on what a search found for a clip that it never completes, and the steps used."""
@@ -178,14 +191,13 @@ class Pretraining:
         self._say(f"{clip}: falls at frame {failure}; a search passes it in {found.passed:.0%} of the rollouts")
         if not found.passed:
             return policy, used
-        others = [other for other in range(len(self._names)) if other != index] or [index]
-        taught, more = self._regression(policy, [(policy, others)], key, found.lessons)
+        taught, more = self._regression(policy, [(policy, self._indices(clip) or [index])], key, found.lessons)
         return taught, used + more
 
     def _distilled(self, best: Policy, key: jax.Array) -> tuple[Policy, int]:
         """The best policy and the experts as one, and the steps used."""
         experts = self._curriculum.experts
-        others = [index for index, name in enumerate(self._names) if name not in experts]
+        others = self._indices(*experts)
         taught = [(best, others)] if others else []
         taught += [(self._load(kept), [self._names.index(name)]) for name, kept in experts.items()]
         return self._regression(best, taught, key)

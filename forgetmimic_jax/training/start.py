@@ -42,6 +42,17 @@ def shipped_base(robot: str) -> Path | None:
     return folder if folder.is_dir() else None
 
 
+def shipped_policies(robot: str, kind: str) -> tuple[Path, ...]:
+    """The folders data/ROBOT/KIND*, by name.
+
+    Args:
+        robot: whose policies they are.
+        kind: `base`, of which data/ROBOT/base is the one that commands take by default, and base-1, base-2, ... are
+            others like it; `control`: retrained controls, the first of them beside the first base.
+    """
+    return tuple(sorted(path for path in (DATA_DIR / robot).glob(f"{kind}*") if path.is_dir()))
+
+
 def base_checkpoint(config: Config) -> Path:
     """The checkpoint that an unlearning run starts from: the one it names, or the shipped one."""
     return base_folder(config.robot) if config.base is None else Path(config.base)
@@ -69,8 +80,10 @@ def with_interface(config: Config, base: Config) -> Config:
 
 
 def unlearned_base(config: Config) -> str | None:
-    """`policy_hash` of the checkpoint that an unlearning run starts from; None for training."""
-    return checkpoint.policy_hash(checkpoint.read_info(base_checkpoint(config))) if config.unlearn.targets else None
+    """`policy_hash` of the checkpoint that an unlearning run starts from or is taught by; None where there is none."""
+    if not config.unlearn.targets or method_of(config).start == "fresh":
+        return None
+    return checkpoint.policy_hash(checkpoint.read_info(base_checkpoint(config)))
 
 
 def fresh_policy(setup: Setup, assets: Assets) -> Policy:

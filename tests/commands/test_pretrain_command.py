@@ -3,12 +3,14 @@
 import dataclasses
 from pathlib import Path
 
+import pytest
 from miniature import TINY
 
 from forgetmimic_jax import pretrain
+from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.motion import quality
 from forgetmimic_jax.motion.library import DATA_DIR
-from forgetmimic_jax.settings.config import Config, load_config, preset
+from forgetmimic_jax.settings.config import Config, load_config, preset, save_config
 from forgetmimic_jax.tracking.setup import make_setup
 
 PHASES = [*TINY, "evaluate_every=4"]
@@ -35,6 +37,22 @@ def test_a_library_of_ones_own_starts_from_the_shipped_base_with_its_observation
     assert (fresh.base, fresh.observation) == (None, Config().observation)
     other = DATA_DIR / "h2" / "base"
     assert config_of(library=library_folder, base=other).base == str(other)
+
+
+def test_a_control_is_trained_from_nothing_without_its_clips(library_folder, refused, tmp_path):
+    found = config_of(library=library_folder, without=" turn, nod")
+    assert (found.base, found.unlearn.targets, found.unlearn.method) == (None, ("turn", "nod"), "retrain")
+    assert (found.sampling.clips, found.ppo) == ("kept", config_of().ppo)
+    save_config(found, tmp_path / "config.yaml")
+    again = pretrain.Options(library=library_folder, without="turn,nod", resume=True)
+    assert pretrain.config_of(again, tmp_path) == found
+    assert pretrain.config_of(dataclasses.replace(again, without=None), tmp_path) == found
+    with pytest.raises(InputError, match="--without: found turn, but the run to resume has turn,nod; leave the flag"):
+        pretrain.config_of(dataclasses.replace(again, without="turn"), tmp_path)
+    base = DATA_DIR / "g1" / "base"
+    given = pretrain.Options(library=library_folder, without="turn", base=base)
+    message = refused(pretrain.main, given)
+    assert message == f"--base: found {base} with --without; accepted: none, since a base may know those clips"
 
 
 def test_what_the_phases_cannot_work_with_is_told_in_one_line(refused, library_folder):

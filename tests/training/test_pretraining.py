@@ -5,18 +5,22 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from trees import assert_same
 
+from forgetmimic_jax.attacks.control import check_never_rolled_out
+from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.basics.files import read_rows
 from forgetmimic_jax.robot.model import load_robot
-from forgetmimic_jax.settings.config import PretrainConfig
+from forgetmimic_jax.settings.config import PretrainConfig, UnlearnConfig
 from forgetmimic_jax.tracking.setup import Setup, make_setup
 from forgetmimic_jax.training import checkpoint, pretraining, watch
 from forgetmimic_jax.training import run as run_module
 from forgetmimic_jax.training.checkpoint import newest_checkpoint
 from forgetmimic_jax.training.pretraining import Pretraining
+from forgetmimic_jax.unlearning.registry import unlearning_config
 
 ITERATIONS = 40
 # (success, tracking) of sway, turn and nod in one evaluation after the other, every two iterations.
@@ -169,6 +173,36 @@ def test_policies_that_nothing_needs_are_removed(unbroken):
     kept = {int(path.name) for path in (unbroken / "policies").iterdir()}
     assert needed in kept
     assert len(kept) <= 2
+
+
+def test_a_clip_that_is_left_out_is_evaluated_but_never_trained_on(setup, tmp_path, monkeypatch):
+    config = dataclasses.replace(setup.config, iterations=8)
+    config = unlearning_config(config, UnlearnConfig(("nod",), "retrain"))
+
+    def measure(self, policy, iteration, environment_steps):
+        clips = {
+            name: {"success_rate": success, "survival_weighted_tracking": success, "episode_length": 20.0}
+            for name, success in zip(NAMES, (0.95, 0.95, 0.0), strict=True)
+        }
+        steps = {"iteration": iteration, "environment_steps": environment_steps}
+        return steps | {"kept_tracking": 0.95, "clips": clips}
+
+    monkeypatch.setattr(watch.Watch, "measure", measure)
+    path, state = run_module.run(make_setup(config), tmp_path / "run", description="", make_course=Pretraining)
+    rows = evaluations(tmp_path / "run")
+    assert [row["phase"] for row in rows] == ["broad", "broad", "settle"]  # the nod does not count as lagging
+    assert [name for name in NAMES if "state" in rows[-1]["clips"][name]] == ["sway", "turn"]
+    log = read_rows(tmp_path / "run" / "metrics.jsonl")
+    assert {(row["clips"]["nod"]["probability"], row["clips"]["nod"]["step_share"]) for row in log} == {(0.0, 0.0)}
+    assert all(row["clips"][name]["probability"] > 0.0 for row in log for name in ("sway", "turn"))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state.policy))
+    info = checkpoint.read_info(tmp_path / "run")
+    assert (info.path.name, info.base) == ("best", None)
+    check_never_rolled_out(info, ("nod",))
+    with pytest.raises(InputError, match=r"unlearn.targets: found \['nod'\]; accepted for a control: \['turn'\]"):
+        check_never_rolled_out(info, ("turn",))
+    pretraining_ = Pretraining(make_setup(config), None, path, None, checkpoint.read_info(path))
+    assert (pretraining_._indices(), pretraining_._indices("turn")) == ([0, 1], [0])
 
 
 @pytest.mark.parametrize(
