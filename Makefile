@@ -10,6 +10,9 @@
 ## PRESET       cpu or paper (default: cpu)
 ## LIBRARY      folder of clips (default: data/ROBOT)
 ## BASE         the policy to start from (default: the shipped one; for pretrain and train, none)
+## BASES        the policies that sweep and experiments start from, comma-separated (default: every data/ROBOT/base*)
+## CONTROLS     retrained controls for the experiments, comma-separated (default: every data/ROBOT/control*)
+## WITHOUT      clips that pretrain leaves out, comma-separated, which makes a retrained control (default: none)
 ## CHECKPOINT   the policy to evaluate, export, play or film (default: the shipped base)
 ## BESIDE       more checkpoints to play or film beside it, comma-separated
 ## RUN          folder of the run to attack, or to report on
@@ -32,7 +35,7 @@ FLAGS = $(foreach name,$(filter-out ARGS PYTHON SWEEP,$(given)),$(call flag,$(na
 
 COMMANDS = pretrain train unlearn evaluate evidence export play video report motions robot bench
 STUDIES = validity comparison penalty heat_map motion_types physical_behaviour training_dynamics relearning membership \
-	number_of_targets
+	number_of_targets overlap
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:

@@ -1,4 +1,4 @@
-"""What ten studies say of the paper's claims, one row each: `python -m experiments.claims`.
+"""What the studies say of the paper's claims and of ours, one row each: `python -m experiments.claims`.
 
 Fills the block of `experiments/README.md` from the studies' JSON alone. Each study states its claim and its findings;
 the rule that gives a claim its word is in `forgetmimic_jax/studies/claim.py`.
@@ -16,6 +16,7 @@ from experiments import (
     membership,
     motion_types,
     number_of_targets,
+    overlap,
     penalty,
     physical_behaviour,
     relearning,
@@ -28,6 +29,7 @@ from forgetmimic_jax.evaluation.tables import markdown_table
 from forgetmimic_jax.studies.claim import answer, corrected
 from forgetmimic_jax.studies.conduct import RESULTS
 from forgetmimic_jax.studies.document import read_document
+from forgetmimic_jax.studies.page import size
 from forgetmimic_jax.studies.study import Study
 
 README = Path(__file__).parent / "README.md"
@@ -44,6 +46,7 @@ STUDIES: Mapping[str, Study] = {
     "g1/training_dynamics": training_dynamics.STUDY,
     "g1/relearning": relearning.STUDY,
     "g1/membership": membership.STUDY,
+    "g1/overlap": overlap.STUDY,
 }
 
 
@@ -58,8 +61,10 @@ def table(folder: Path = RESULTS, studies: Mapping[str, Study] = STUDIES) -> str
         found = answer(study.claim, corrected(study.findings(document)))
         link = f"[{study.name}](results/{name}.md)"
         measured = study.answer(document) if study.answer else f"{found.evidence[:1].upper()}{found.evidence[1:]}."
-        rows.append([found.claim, f"**{found.word}**", measured, str(found.seeds), link])
-    text = markdown_table(["the paper's claim", "here", "what was measured", "seeds", "study"], rows) if rows else ""
+        claim = f"Ours: {found.claim}" if study.ours else found.claim
+        rows.append([claim, f"**{found.word}**", measured, size(document), link])
+    header = ["the paper's claim", "here", "what was measured", "runs of each kind", "study"]
+    text = markdown_table(header, rows) if rows else ""
     return f"{text}\nNot measured yet: {', '.join(missing)}.\n" if missing else text
 
 

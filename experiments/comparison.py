@@ -6,13 +6,14 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from experiments.validity import PLAIN
-from forgetmimic_jax.evaluation import statistics
+from forgetmimic_jax.evaluation.repeats import over_repeats
 from forgetmimic_jax.evaluation.tables import markdown_table, number
 from forgetmimic_jax.studies import paper, samplers
 from forgetmimic_jax.studies.claim import Finding, finding
 from forgetmimic_jax.studies.conduct import main
 from forgetmimic_jax.studies.findings import SUCCESS, kept_stay, mean_gained
 from forgetmimic_jax.studies.lab import Lab
+from forgetmimic_jax.studies.policies import retrained_in_words
 from forgetmimic_jax.studies.study import Document, Study
 from forgetmimic_jax.studies.variants import TRACKING, paired, variant_bars, variant_table
 from forgetmimic_jax.unlearning import distill
@@ -48,21 +49,19 @@ METHODS: dict[str, dict[str, Any]] = {
 
 
 def measure(lab: Lab) -> dict[str, Any]:
-    """Every method and the ablation; a retrained policy as often as the preset allows."""
-    retrain = {"retrained": {"method": "retrain", "iterations": lab.control_iterations}}
+    """Every method and the ablation, and the retrained control."""
     arft = {f"{ARFT}, {label}": variant for label, variant in samplers.ablation().items()}
-    return lab.over_seeds({**METHODS, **arft, **retrain}, "comparison", seeds={"retrained": lab.control_seeds})
+    return lab.over_repeats({**METHODS, **arft}, "comparison", others={"retrained": lab.retrained})
 
 
 def body(document: Document) -> str:
-    """The table, and the differences from base and fine-tuned control, seed by seed."""
+    """The table, and the differences from base and fine-tuned control, run by run."""
     variants, conditions = document["results"]["variants"], document["conditions"]
     parts = [variant_table(variants, paper.COMPARISON)]
     if "retrained" in variants:
         parts.append(
-            f"*retrained*: {conditions['control_iterations']:,} iterations from scratch with the base's own settings; "
-            f"the base was trained for {conditions['base_environment_steps']:,} environment steps. *arft* has λ = 16, "
-            "also in the rows by sampler, where each sampler gives the targets its own share of the starts.\n"
+            f"{retrained_in_words(conditions)} *arft* has λ = 16, also in the rows by sampler, where each sampler "
+            "gives the targets its own share of the starts.\n"
         )
     if conditions["preset"] == "cpu":
         parts.append(
@@ -82,7 +81,7 @@ def body(document: Document) -> str:
 
 
 def against_base_and_control(variants: Mapping[str, Any], label: str) -> list[str]:
-    """Points of success that kept clips gained on the base's and the control's of the same seed; retained tracking."""
+    """Points of success that kept clips gained on the base and on the control of the same repeat; retained tracking."""
     kinds: list[tuple[str, Callable[[float, float], float], int]] = [
         (SUCCESS, lambda mine, theirs: 100.0 * (mine - theirs), 1),
         (TRACKING, lambda mine, theirs: mine / theirs, 3),
@@ -91,8 +90,8 @@ def against_base_and_control(variants: Mapping[str, Any], label: str) -> list[st
     for metric, against, digits in kinds:
         for other in (None, CONTROL):
             pairs = paired(variants, label, other, "kept", metric)
-            values = [against(*pair) for seed, pair in pairs.items() if seed in variants[CONTROL]["seeds"]]
-            cells.append(number(statistics.over_seeds(values), digits) if values else "")
+            values = {at: against(*pair) for at, pair in pairs.items() if at in variants[CONTROL]["runs"]}
+            cells.append(number(over_repeats(values), digits) if values else "")
     return cells
 
 
@@ -138,7 +137,7 @@ STUDY = Study(
     answer=answer,
     conditions=lambda lab: {
         "values": [*METHODS, *samplers.ablation()],
-        "control_iterations": lab.control_iterations,
+        **lab.control_conditions(),
     },
 )
 

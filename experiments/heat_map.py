@@ -15,7 +15,7 @@ from forgetmimic_jax.studies.conduct import main
 from forgetmimic_jax.studies.findings import share
 from forgetmimic_jax.studies.lab import Lab
 from forgetmimic_jax.studies.study import Document, Study
-from forgetmimic_jax.studies.variants import TRACKING, over_seeds, within
+from forgetmimic_jax.studies.variants import TRACKING, estimates_of, within
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -26,17 +26,21 @@ BOUND = 0.95  # of the kept clips' tracking at the start
 
 
 def measure(lab: Lab) -> dict[str, Any]:
-    """Each seed's run, evaluated 21 times during training."""
-    conditions = {("λ = 16", seed): {"seed": seed, "set": lab.watched(CHECKPOINTS)} for seed in lab.seeds}
-    columns: list[list[Any]] = []
-    groups: list[list[Any]] = []
-    for (_, seed), folder in lab.run(conditions, "heat map").items():
+    """Each repeat's run, evaluated 21 times during training."""
+    variants = {("λ = 16", repeat): {"set": lab.watched(CHECKPOINTS)} for repeat in lab.repeats}
+    columns: dict[str, list[Any]] = {}
+    groups: dict[str, list[Any]] = {}
+    for (_, repeat), folder in lab.run(variants, "heat map").items():
         rows = read_rows(folder / "evaluations.jsonl")
-        clips = [lab.as_watched({"base": lab.base}, seed)["base"], *(row["clips"] for row in rows)]
-        columns.append([{clip: {name: of[name] for name in SHOWN} for clip, of in at.items()} for at in clips])
-        groups.append([group_means(at, lab.targets) for at in columns[-1]])
+        first = lab.as_watched({"base": lab.bases[repeat.base].path}, repeat.seed)["base"]
+        clips = [first, *(row["clips"] for row in rows)]
+        shown = [{clip: {name: of[name] for name in SHOWN} for clip, of in at.items()} for at in clips]
+        columns[str(repeat)], groups[str(repeat)] = shown, [group_means(at, lab.targets) for at in shown]
         iterations = [0, *(row["iteration"] for row in rows)]
-    checkpoints, means = ([over_seeds(at) for at in zip(*of, strict=True)] for of in (columns, groups))
+    checkpoints, means = (
+        [estimates_of({repeat: column[place] for repeat, column in of.items()}) for place in range(len(iterations))]
+        for of in (columns, groups)
+    )
     return {"iterations": iterations, "checkpoints": checkpoints, "groups": means}
 
 

@@ -11,20 +11,27 @@ import numpy as np
 
 from forgetmimic_jax.evaluation.membership import FALSE_POSITIVES, attack, features
 from forgetmimic_jax.evaluation.plots import bars, new_figure
+from forgetmimic_jax.evaluation.repeats import Repeat
 from forgetmimic_jax.evaluation.statistics import Estimate
 from forgetmimic_jax.evaluation.tables import markdown_table, number
 from forgetmimic_jax.studies import paper
 from forgetmimic_jax.studies.claim import FAILS, OPEN, Finding, finding, p_value
 from forgetmimic_jax.studies.conduct import main
-from forgetmimic_jax.studies.lab import Lab, newest_policy
+from forgetmimic_jax.studies.lab import Key, Lab, newest_policy
+from forgetmimic_jax.studies.policies import retrained_in_words
 from forgetmimic_jax.studies.study import Document, Study
-from forgetmimic_jax.studies.variants import over_seeds, within
+from forgetmimic_jax.studies.variants import estimates_of, within
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 GUESSED = 0.5  # AUC and accuracy of guessing
 UNLEARNED = "λ = 16"
+VARIANTS: dict[str, dict[str, Any]] = {
+    UNLEARNED: {},
+    "fine-tuned, all clips": {"method": "finetune", "clips": "all"},
+    "distilled": {"method": "distill"},
+}
 NAMES = {"accuracy": "accuracy", "auc": "AUC", "tpr_at_5_percent_fpr": "TPR at 5 % FPR"}
 
 
@@ -35,31 +42,23 @@ def measure(lab: Lab) -> dict[str, Any]:
     from forgetmimic_jax.robot.model import load_robot
     from forgetmimic_jax.tracking.setup import library_folder
 
-    runs = lab.run(
-        {
-            **{(UNLEARNED, seed): {"seed": seed} for seed in lab.seeds},
-            **{("fine-tuned, all clips", s): {"method": "finetune", "clips": "all", "seed": s} for s in lab.seeds},
-            **{("distilled", seed): {"method": "distill", "seed": seed} for seed in lab.seeds},
-            **{
-                ("retrained", seed): {"method": "retrain", "iterations": lab.control_iterations, "seed": seed}
-                for seed in lab.control_seeds
-            },
-        },
-        "membership",
-    )
-    policies: dict[tuple[str, int], Path] = {("base", 0): lab.base}
+    variants = {(label, repeat): variant for label, variant in VARIANTS.items() for repeat in lab.repeats}
+    variants |= {("retrained", repeat): variant for repeat, variant in lab.retrained.items()}
+    runs = lab.run(variants, "membership")
+    policies: dict[Key, Path] = {("base", Repeat(place, 0)): base.path for place, base in enumerate(lab.bases)}
     policies |= {key: newest_policy(folder) for key, folder in runs.items()}
     robot = load_robot(lab.config.robot)
-    clips = [read_clip(library_folder(lab.config) / f"{name}.npz") for name in lab.info.clips]
+    clips = [read_clip(library_folder(lab.config) / f"{name}.npz") for name in lab.bases[0].clips]
     members, names = lab.rollouts(policies, clips)
     twins, _ = lab.rollouts(policies, [mirrored(robot, clip) for clip in clips])
     is_target = np.isin(next(iter(members.values())).clip, [names.index(target) for target in lab.targets])
-    attacks: dict[str, list[dict[str, float]]] = {}
+    attacks: dict[str, dict[str, dict[str, float]]] = {}
     for key, rollout in members.items():
         both = features(rollout, twins[key])
         known, unknown = (tuple(values[mask] for values in both) for mask in (~is_target, is_target))
-        attacks.setdefault(key[0], []).append(dataclasses.asdict(attack(known, unknown)))  # type: ignore[arg-type]
-    return {"policies": {label: over_seeds(found) for label, found in attacks.items()}}
+        label, repeat = key
+        attacks.setdefault(label, {})[str(repeat)] = dataclasses.asdict(attack(known, unknown))  # type: ignore[arg-type]
+    return {"policies": {label: estimates_of(found) for label, found in attacks.items()}}
 
 
 def guessed_hits(conditions: Mapping[str, Any]) -> float:
@@ -81,11 +80,11 @@ def body(document: Document) -> str:
         "It learned what trained clips look like from the kept clips and their mirror images. Guessing gives accuracy "
         f"0.5, AUC 0.5 and a TPR of {guessed:.2f} (more than 0.05 because there are few mirror images). An AUC above "
         "0.5: the policy does the targets as it does trained clips. Below 0.5: it does them worse than clips that it "
-        "never saw, and is marked by having forgotten them. Intervals are over policies. The retrained policy was "
-        f"trained for {document['conditions']['control_iterations']:,} iterations. This is one attack: if it finds "
-        "nothing, something may still be left. The paper's attack is another, on another library.\n"
+        "never saw, and is marked by having forgotten them. "
+        f"{retrained_in_words(document['conditions'])} This is one attack: if it finds nothing, something may still be "
+        "left. The paper's attack is another, on another library.\n"
     )
-    return f"{markdown_table(['', 'policies', *NAMES.values()], rows)}\n{note}"
+    return f"{markdown_table(['', 'n', *NAMES.values()], rows)}\n{note}"
 
 
 def findings(document: Document) -> Iterator[Finding]:
@@ -135,7 +134,7 @@ STUDY = Study(
     draw=draw,
     findings=findings,
     answer=answer,
-    conditions=lambda lab: {"control_iterations": lab.control_iterations},
+    conditions=lambda lab: lab.control_conditions(),
 )
 
 if __name__ == "__main__":

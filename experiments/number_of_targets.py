@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from forgetmimic_jax.studies import paper
 from forgetmimic_jax.studies.conduct import main
-from forgetmimic_jax.studies.lab import Options
+from forgetmimic_jax.studies.options import Options
 from forgetmimic_jax.studies.targets import targets_study
 
 GROUPS = ("dance_a", "punch,kick", "jump,spinkick,cartwheel")  # dance, combat and acrobatics, as in the paper

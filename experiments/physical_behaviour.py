@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from experiments.validity import LENGTH, NO_FURTHER_OFF, SOONER
-from forgetmimic_jax.evaluation import metrics, statistics, tables
+from forgetmimic_jax.evaluation import metrics, tables
 from forgetmimic_jax.evaluation.plots import new_figure
+from forgetmimic_jax.evaluation.repeats import Repeat, over_repeats
 from forgetmimic_jax.evaluation.statistics import Estimate
 from forgetmimic_jax.evaluation.tables import UNITS, markdown_table, number, percent
 from forgetmimic_jax.studies.claim import Finding, finding
 from forgetmimic_jax.studies.conduct import main
-from forgetmimic_jax.studies.lab import Lab, newest_policy
+from forgetmimic_jax.studies.lab import Key, Lab, newest_policy
 from forgetmimic_jax.studies.study import Document, Study
 from forgetmimic_jax.studies.variants import DEVIATION, within
 
@@ -38,22 +39,23 @@ UNLEARNED, ZERO = "λ = 16", "zero action"
 def measure(lab: Lab) -> dict[str, Any]:
     """Every policy on the same episodes of the targets; every episode's six numbers."""
     runs = lab.run(
-        {(label, seed): {**variant, "seed": seed} for label, variant in VARIANTS.items() for seed in lab.seeds},
+        {(label, repeat): variant for label, variant in VARIANTS.items() for repeat in lab.repeats},
         "physical behaviour",
     )
-    policies: dict[tuple[str, int], Path | None] = {("base", 0): lab.base, (ZERO, 0): None}
+    policies: dict[Key, Path | None] = {("base", Repeat(place, 0)): base.path for place, base in enumerate(lab.bases)}
+    policies[ZERO, Repeat(0, 0)] = None
     policies |= {key: newest_policy(folder) for key, folder in runs.items()}
     rollouts, names = lab.rollouts(policies)
     common = metrics.common_length(rollouts.values())
     on_target = np.isin(next(iter(rollouts.values())).clip, [names.index(target) for target in lab.targets])
     result: dict[str, Any] = {}
-    for (label, seed), rollout in rollouts.items():
+    for (label, repeat), rollout in rollouts.items():
         values = metrics.episode_metrics(rollout, common)
         shown = [*MEASURES, *(name + metrics.COMMON for name in ERRORS)]
-        result.setdefault(label, {})[str(seed)] = {name: values[name][on_target].round(5).tolist() for name in shown}
+        result.setdefault(label, {})[str(repeat)] = {name: values[name][on_target].round(5).tolist() for name in shown}
     without_end: dict[str, Any] = {}
-    for (label, seed), numbers in lab.unbounded(policies).items():
-        without_end.setdefault(label, {})[str(seed)] = {
+    for (label, repeat), numbers in lab.unbounded(policies).items():
+        without_end.setdefault(label, {})[str(repeat)] = {
             name: [None if np.isnan(value) else round(float(value), 5) for value in values]
             for name, values in numbers.items()
         }
@@ -62,7 +64,7 @@ def measure(lab: Lab) -> dict[str, Any]:
 
 def over_runs(policies: Document, label: str, name: str) -> Estimate:
     """A measure of a kind of policy, over its runs."""
-    return statistics.over_seeds([float(np.mean(run[name])) for run in policies[label].values()])
+    return over_repeats({repeat: float(np.mean(run[name])) for repeat, run in policies[label].items()})
 
 
 def words(name: str) -> str:
@@ -72,7 +74,7 @@ def words(name: str) -> str:
 
 
 def body(document: Document) -> str:
-    """Means over the seeds, over the steps alive and over the steps that every policy survives."""
+    """Means over the runs, over the steps alive and over the steps that every policy survives."""
     policies = document["results"]["policies"]
     rows = []
     for name in (*MEASURES, *(name + metrics.COMMON for name in ERRORS)):
@@ -112,10 +114,14 @@ def unbounded_table(policies: Document) -> str:
 def unbounded_over_runs(policies: Document, label: str, name: str) -> Estimate | None:
     """A number of `tables.UNBOUNDED` of a kind of policy, over its runs; None where no run defines it."""
     quantile = {"impact_force_median": 0.5, "impact_force_95": 0.95}.get(name)
-    runs = [run["impact_force" if quantile else name] for run in policies[label].values()]
-    defined = [[value for value in run if value is not None] for run in runs]
-    found = [np.quantile(run, quantile, method="inverted_cdf") if quantile else np.mean(run) for run in defined if run]
-    return statistics.over_seeds(found) if found else None
+    runs = {repeat: run["impact_force" if quantile else name] for repeat, run in policies[label].items()}
+    defined = {repeat: [value for value in run if value is not None] for repeat, run in runs.items()}
+    found = {
+        repeat: float(np.quantile(run, quantile, method="inverted_cdf") if quantile else np.mean(run))
+        for repeat, run in defined.items()
+        if run
+    }
+    return over_repeats(found) if found else None
 
 
 def findings(document: Document) -> Iterator[Finding]:

@@ -18,21 +18,21 @@ import msgspec
 import numpy as np
 
 from forgetmimic_jax.basics.files import read_rows
-from forgetmimic_jax.evaluation import statistics
 from forgetmimic_jax.evaluation.document import FILE, read_evaluation
 from forgetmimic_jax.evaluation.plots import new_figure
 from forgetmimic_jax.evaluation.relearning import Lasted, Origin, Origins, at_first, comparable_settings, lasted
+from forgetmimic_jax.evaluation.repeats import Repeat, over_repeats
 from forgetmimic_jax.evaluation.tables import markdown_table, number, percent
 from forgetmimic_jax.evaluation.verdict import retained, skills
-from forgetmimic_jax.settings.config import load_config
 from forgetmimic_jax.studies import paper
 from forgetmimic_jax.studies.claim import Between, Finding, finding_between
 from forgetmimic_jax.studies.conduct import main
 from forgetmimic_jax.studies.findings import share
-from forgetmimic_jax.studies.lab import Lab, newest_policy
+from forgetmimic_jax.studies.lab import Key, Lab, newest_policy
+from forgetmimic_jax.studies.policies import retrained_in_words
 from forgetmimic_jax.studies.study import ITERATIONS, Document, Study
 from forgetmimic_jax.studies.variants import TRACKING, within
-from forgetmimic_jax.training.checkpoint import policy_hash
+from forgetmimic_jax.training.checkpoint import policy_hash, read_info
 from forgetmimic_jax.unlearning.method import FINE_TUNING, SHORT
 from forgetmimic_jax.unlearning.registry import method_of
 
@@ -49,46 +49,46 @@ HEAD_START = 0.8  # of a level: a control that starts above that says little of 
 def measure(lab: Lab) -> dict[str, Any]:
     """First the policies to start from, then their relearning."""
     length = {"iterations": ITERATIONS[lab.options.preset]}
-    trials: dict[tuple[str, int], dict[str, Any]] = {
-        ("unlearned", seed): {**length, "seed": seed} for seed in lab.seeds
-    }
-    trials |= {("distilled", seed): {**length, "method": "distill", "seed": seed} for seed in lab.seeds}
-    retrain = {"method": "retrain", "iterations": lab.control_iterations}
-    trials |= {("retrained", seed): {**retrain, "seed": seed} for seed in lab.control_seeds}
+    trials: dict[Key, dict[str, Any]] = {("unlearned", repeat): length for repeat in lab.repeats}
+    trials |= {("distilled", repeat): {**length, "method": "distill"} for repeat in lab.repeats}
+    trials |= {("retrained", repeat): variant for repeat, variant in lab.retrained.items()}
     folders = lab.run(trials, "policies to relearn from")
+    if lab.controls:  # each relearns with every seed
+        trained = {repeat: folders.get(("retrained", Repeat(repeat.base, 0))) for repeat in lab.repeats}
+        folders |= {("retrained", repeat): folder for repeat, folder in trained.items() if folder}
     policies = {key: newest_policy(folder) for key, folder in folders.items()}
     relearned = lab.run(relearning_runs(lab, policies), "relearning")
     base: dict[str, float] = {}
     curves: dict[str, Any] = {label: {} for label, _ in relearned}
-    for seed in lab.seeds:
-        starts = {label: policy for (label, of), policy in policies.items() if of == seed}
-        first = lab.as_watched({"base": lab.base, **starts}, seed)
-        base[str(seed)] = _tracking(first["base"], lab.targets)
+    for repeat in lab.repeats:
+        starts = {label: policy for (label, of), policy in policies.items() if of == repeat}
+        first = lab.as_watched({"base": lab.bases[repeat.base].path, **starts}, repeat.seed)
+        base[str(repeat)] = _tracking(first["base"], lab.targets)
         for (label, of), folder in relearned.items():
-            if of == seed:
-                curves[label][str(seed)] = curve_of(folder, lab.targets, first.get(label))
+            if of == repeat:
+                curves[label][str(repeat)] = curve_of(folder, lab.targets, first.get(label))
     return {"base": base, "starts": curves, "origins": msgspec.to_builtins(origins(lab, folders))}
 
 
-def origins(lab: Lab, folders: Mapping[tuple[str, int], Path]) -> Origins:
+def origins(lab: Lab, folders: Mapping[Key, Path]) -> Origins:
     """How the policies of each start were trained, so that a report can see whether the curves belong to its run.
 
     Args:
         lab: of the study.
-        folders: by start and seed, the run that trained the policy.
+        folders: by start and repeat, the run that trained or evaluated the policy.
     """
     starts: dict[str, Origin] = {}
-    for (label, seed), folder in folders.items():
-        config = load_config(folder / "config.yaml")
+    for (label, repeat), folder in folders.items():
+        config = read_info(newest_policy(folder)).config
         origin = starts.setdefault(label, Origin(comparable_settings(config), {}))
         kept = skills(read_evaluation(folder / FILE).policies[method_of(config).result], target=False)
         if kept:
-            origin.kept_skill[str(seed)] = retained(kept).estimate
-    return Origins(policy_hash(lab.info), starts)
+            origin.kept_skill[str(repeat)] = retained(kept).estimate
+    return Origins([policy_hash(base) for base in lab.bases], starts)
 
 
-def relearning_runs(lab: Lab, policies: Mapping[tuple[str, int], Path]) -> dict[tuple[str, int], dict[str, Any]]:
-    """The options of each relearning run, by start and seed.
+def relearning_runs(lab: Lab, policies: Mapping[Key, Path]) -> dict[Key, dict[str, Any]]:
+    """The options of each relearning run, by start and repeat.
 
     All of them have the same fixed step size and no KL to their start; settings of their own would be those that they
     were trained with. On a laptop half of the starts are on the targets, as in unlearning: whoever wants the targets
@@ -99,12 +99,11 @@ def relearning_runs(lab: Lab, policies: Mapping[tuple[str, int], Path]) -> dict[
     alike = [f"ppo.{setting}={json.dumps(value)}" for setting, value in pace.items()]
     alike += ["wrench.max_gain=0.0", f"sampling.target_share={FINE_TUNING.target_share.get(name, 0.0)}"]
     watched = {"clips": "all", "set": [*lab.watched(EVALUATIONS), *alike]}
-    runs: dict[tuple[str, int], dict[str, Any]] = {
-        (label, seed): {**watched, "method": "finetune", "base": policy, "seed": seed}
-        for (label, seed), policy in policies.items()
+    runs: dict[Key, dict[str, Any]] = {
+        key: {**watched, "method": "finetune", "base": policy} for key, policy in policies.items()
     }
     fresh = {**watched, "method": "retrain", "sampler": "uniform_clips"}
-    return runs | {("fresh", seed): {**fresh, "seed": seed} for seed in lab.seeds}
+    return runs | {("fresh", repeat): fresh for repeat in lab.repeats}
 
 
 def _tracking(clips: Mapping[str, Mapping[str, float]], targets: tuple[str, ...]) -> float:
@@ -135,29 +134,28 @@ def curve_of(
 
 
 def body(document: Document) -> str:
-    """Iterations and target steps until each share of the base, over the seeds that reached it."""
+    """Iterations and target steps until each share of the base, over the runs."""
     results = document["results"]
     rows = []
     for label in results["starts"]:
         for level in SHARES:
-            found = lasted(results, label, level).values()
-            reached = sum(run.there for run in found)
+            found = lasted(results, label, level)
+            reached = sum(run.there for run in found.values())
             cells = []
             for place in (0, 1):
-                mean = statistics.over_seeds([run[place] for run in found])
+                mean = over_repeats({repeat: run[place] for repeat, run in found.items()})
                 cells.append(number(mean, 0) if reached == len(found) else f"more than {mean['mean']:,.0f}")
-            before = list(at_first(results, label).values())
-            first = percent(within(statistics.over_seeds(before), 0.0, np.inf)) if before else ""
+            before = at_first(results, label)
+            first = percent(within(over_repeats(before), 0.0, np.inf)) if before else ""
             rows.append([label, first, share(level), f"{reached} of {len(found)}", *cells])
     theirs = ", ".join(f"{iterations:,} for {clips}" for clips, iterations in paper.RELEARNING.items())
     note = (
         "At the start and shares: of the base's survival-weighted tracking on the targets, "
-        f"{number(statistics.over_seeds(list(results['base'].values())))}, on the same episodes. A share is reached at "
+        f"{number(over_repeats(results['base']))}, on the same episodes. A share is reached at "
         "the first of two evaluations in a row that are not below it. More than: a run that never reached it counts "
         "with its end. No start is regularised towards a base, and with the cpu preset half of the starts are on the "
-        f"targets. The retrained policy was trained for {document['conditions']['control_iterations']:,} iterations; a "
-        "short training makes it a reference for the first steps only. The paper (another library and budget) took "
-        f"{theirs} until 95 % of its tracking while alive, from its unlearned policy; it has no control.\n"
+        f"targets. {retrained_in_words(document['conditions'])} The paper (another library and budget) took {theirs} "
+        "until 95 % of its tracking while alive, from its unlearned policy; it has no control.\n"
     )
     header = ["start", "at the start", "share of the base", "runs that reached it", "iterations", "target steps"]
     return f"{markdown_table(header, rows)}\n{note}"
@@ -167,7 +165,8 @@ def findings(document: Document) -> Iterator[Finding]:
     """Fig. 8, with the controls that the paper lacks."""
     results = document["results"]
     for control, level in itertools.product(CONTROLS, SHARES):
-        if {"unlearned", control} <= results["starts"].keys():
+        runs = [results["starts"].get(label, {}) for label in ("unlearned", control)]
+        if set.intersection(*map(set, runs)):
             yield _no_sooner(results, control, level)
 
 
@@ -178,7 +177,7 @@ def answer(document: Document) -> str:
     for control in CONTROLS:
         theirs = lasted(results, control, MAIN_SHARE) if control in results["starts"] else {}
         if theirs.keys() == mine.keys():
-            more = statistics.over_seeds([mine[seed].target_steps - theirs[seed].target_steps for seed in mine])
+            more = over_repeats({at: mine[at].target_steps - theirs[at].target_steps for at in mine})
             parts.append(f"{number(more, 0)} ({control})")
     return (
         f"Steps on the targets until {share(MAIN_SHARE)} of the base's tracking, of the unlearned policy minus of one "
@@ -189,19 +188,19 @@ def answer(document: Document) -> str:
 def _no_sooner(results: Mapping[str, Any], control: str, level: float) -> Finding:
     """The unlearned policy needs no fewer target steps than a control until a share `level` of the base."""
     mine, theirs = (lasted(results, label, level) for label in ("unlearned", control))
-    both = [seed for seed in mine if seed in theirs]
+    both = [repeat for repeat in mine if repeat in theirs]
     claim = f"{share(level)} of the tracking comes back after no fewer target steps than a {control} policy needs"
-    more = statistics.over_seeds([mine[seed].target_steps - theirs[seed].target_steps for seed in both])
-    mean = float(np.mean([theirs[seed].target_steps for seed in both]))
+    more = over_repeats({at: mine[at].target_steps - theirs[at].target_steps for at in both})
+    mean = float(np.mean([theirs[repeat].target_steps for repeat in both]))
     evidence = f"target steps until {share(level)}, unlearned minus {control} {number(more, 0)}; bound 0"
     evidence += f"; {control} {mean:,.0f}"
     for label, of in (("unlearned", mine), (control, theirs)):
-        never = sum(not of[seed].there for seed in both)
+        never = sum(not of[repeat].there for repeat in both)
         evidence += f"; {label} never got there in {never} of {len(both)} runs" if never else ""
-    head_start = float(np.mean([at_first(results, control).get(seed, 0.0) for seed in both]))
+    head_start = float(np.mean([at_first(results, control).get(repeat, 0.0) for repeat in both]))
     if head_start >= HEAD_START * level:
-        return Finding(claim, "the control starts near it", f"{evidence}, and starts at {share(head_start)}", len(both))
-    differences = [more_steps(mine[seed], theirs[seed]) for seed in both]
+        return Finding(claim, "the control starts near it", f"{evidence}, and starts at {share(head_start)}", more["n"])
+    differences = {repeat: more_steps(mine[repeat], theirs[repeat]) for repeat in both}
     main = level == MAIN_SHARE and len(both) == len(mine)
     return finding_between(claim, differences, 0.0, evidence, below=False, main=main)
 
@@ -241,7 +240,7 @@ STUDY = Study(
     draw=draw,
     findings=findings,
     answer=answer,
-    conditions=lambda lab: {"control_iterations": lab.control_iterations},
+    conditions=lambda lab: lab.control_conditions(),
 )
 
 if __name__ == "__main__":

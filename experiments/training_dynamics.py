@@ -13,7 +13,7 @@ from forgetmimic_jax.studies.claim import Finding, finding
 from forgetmimic_jax.studies.conduct import main
 from forgetmimic_jax.studies.lab import Lab
 from forgetmimic_jax.studies.study import Document, Study
-from forgetmimic_jax.studies.variants import over_seeds
+from forgetmimic_jax.studies.variants import estimates_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -39,18 +39,28 @@ THEIRS = {
 
 
 def measure(lab: Lab) -> dict[str, Any]:
-    """The logged curves of both configurations over the seeds."""
-    conditions = {(label, seed): {**of, "seed": seed} for label, of in CONFIGURATIONS.items() for seed in lab.seeds}
-    runs = lab.run(conditions, "training dynamics")
+    """The logged curves of both configurations over the repeats."""
+    variants = {(label, repeat): of for label, of in CONFIGURATIONS.items() for repeat in lab.repeats}
+    runs = lab.run(variants, "training dynamics")
     result = {}
     for label in CONFIGURATIONS:
-        folders = [folder for (of, _), folder in runs.items() if of == label]
-        logs = [{row["iteration"]: row for row in read_rows(folder / "metrics.jsonl")} for folder in folders]
+        folders = {str(repeat): folder for (of, repeat), folder in runs.items() if of == label}
+        logs = {
+            repeat: {row["iteration"]: row for row in read_rows(folder / "metrics.jsonl")}
+            for repeat, folder in folders.items()
+        }
         if logs:
             # A run that was stopped and resumed has one row more, at the iteration where it was stopped.
-            common = sorted(set(logs[0]).intersection(*logs))
-            rows = [over_seeds([{name: log[at][name] for name in CURVES if name in log[at]} for log in logs])
-                    for at in common]  # fmt: skip
+            common = sorted(set.intersection(*map(set, logs.values())))
+            rows = [
+                estimates_of(
+                    {
+                        repeat: {name: log[at][name] for name in CURVES if name in log[at]}
+                        for repeat, log in logs.items()
+                    }
+                )
+                for at in common
+            ]
             result[label] = {"iterations": common, "rows": rows}
     return {"configurations": result}
 
@@ -96,7 +106,7 @@ def findings(document: Document) -> Iterator[Finding]:
 
 
 def difference(last: Estimate, first: Estimate) -> Estimate:
-    """Of two estimates whose seeds are not known one by one: as wide as both intervals together."""
+    """Of two estimates whose runs are not known one by one: as wide as both intervals together."""
     result: Estimate = {"mean": last["mean"] - first["mean"], "n": last["n"]}
     if "low" in last and "low" in first:
         ends: Estimate = {"low": last["low"] - first["high"], "high": last["high"] - first["low"]}

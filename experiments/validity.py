@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from forgetmimic_jax.evaluation import statistics
 from forgetmimic_jax.evaluation.metrics import ZERO_ACTION
+from forgetmimic_jax.evaluation.repeats import over_repeats
 from forgetmimic_jax.evaluation.tables import number, percent
 from forgetmimic_jax.studies import paper
 from forgetmimic_jax.studies.claim import Finding, finding
@@ -104,15 +104,15 @@ def against_zero_action(variants: Mapping[str, Any], label: str) -> Iterator[Fin
     ratio = estimates(variants[label])["policy"][RATIO]
     evidence = f"target over kept tracking {number(within(ratio, 0.0, np.inf), 3)}; bound {BOUND_RATIO:g}"
     yield finding(f"{label}: the targets' tracking is under a tenth of the kept clips'", ratio, BOUND_RATIO, evidence)
-    runs = [(run["policy"]["target"], run[ZERO_ACTION]["target"]) for run in variants[label]["seeds"].values()]
-    later = statistics.over_seeds([policy[LENGTH] - baseline[LENGTH] for policy, baseline in runs])
+    runs = {at: (run["policy"]["target"], run[ZERO_ACTION]["target"]) for at, run in variants[label]["runs"].items()}
+    later = over_repeats({at: policy[LENGTH] - baseline[LENGTH] for at, (policy, baseline) in runs.items()})
     evidence = f"length of target episodes minus the zero-action baseline's {number(later, 1)} steps; bound {-SOONER:g}"
     claim = f"{label}: the policy lacks the skill and does not end episodes on purpose"
     yield finding(claim, later, -SOONER, evidence, below=False)
-    off = [(policy[DEVIATION], baseline[DEVIATION]) for policy, baseline in runs if DEVIATION in policy]
+    off = {at: (one[DEVIATION], other[DEVIATION]) for at, (one, other) in runs.items() if DEVIATION in one}
     if off:
-        further = statistics.over_seeds([policy - baseline for policy, baseline in off])
-        mean = np.mean([baseline for _, baseline in off])
+        further = over_repeats({at: policy - baseline for at, (policy, baseline) in off.items()})
+        mean = np.mean([baseline for _, baseline in off.values()])
         evidence = (
             f"largest key body error minus the zero-action baseline's {number(further, 3)} m, of {mean:.3f} m, on the "
             "steps that both and the base survive; bound 0"

@@ -11,7 +11,8 @@ import tyro
 
 from forgetmimic_jax.basics.errors import run_command
 from forgetmimic_jax.settings.options import parse
-from forgetmimic_jax.studies import lab, paper
+from forgetmimic_jax.studies import options as study_options
+from forgetmimic_jax.studies import paper
 from forgetmimic_jax.studies.claim import Finding
 from forgetmimic_jax.studies.conduct import conduct
 from forgetmimic_jax.studies.findings import forgotten_and_kept, kept_stay, no_success, skill_gone
@@ -22,7 +23,7 @@ from forgetmimic_jax.studies.targets import targets_study
 
 
 @dataclass(kw_only=True)
-class Options(lab.Options):
+class Options(study_options.Options):
     """Run the missing trials of a sweep, then write its JSON, its page and its figure."""
 
     kind: Annotated[Literal["lambda", "targets", "sampler", "seeds"], tyro.conf.Positional]

@@ -25,13 +25,13 @@ class Origin(msgspec.Struct):
     """How the policies of one start were trained, and how well they do."""
 
     settings: dict[str, Any]  # see `comparable_settings`
-    kept_skill: dict[str, Estimate]  # by seed: share of the base's skill that the kept clips retain
+    kept_skill: dict[str, Estimate]  # by repeat: share of the base's skill that the kept clips retain
 
 
 class Origins(msgspec.Struct):
     """The policies that relearning started from."""
 
-    base: str  # `checkpoint.policy_hash` of the base
+    bases: list[str]  # `checkpoint.policy_hash` of each base
     starts: dict[str, Origin]  # unlearned, distilled, retrained
 
 
@@ -59,7 +59,7 @@ def crossing(curve: Mapping[str, list[float]], level: float) -> tuple[float, flo
 
 
 def lasted(results: Mapping[str, Any], start: str, share: float) -> dict[str, Lasted]:
-    """By seed: how long until a start reached a share of the base's tracking on the same episodes.
+    """By repeat: how long until a start reached a share of the base's tracking on the same episodes.
 
     A run that never reached it counts with its end, and needs longer than that.
 
@@ -69,18 +69,18 @@ def lasted(results: Mapping[str, Any], start: str, share: float) -> dict[str, La
         share: of the base's survival-weighted tracking on the targets.
     """
     result = {}
-    for seed, curve in results["starts"][start].items():
-        found = crossing(curve, share * results["base"][seed])
+    for repeat, curve in results["starts"][start].items():
+        found = crossing(curve, share * results["base"][repeat])
         iterations, steps = found or (curve["iterations"][-1], curve["target_steps"][-1])
-        result[seed] = Lasted(iterations, steps, found is not None)
+        result[repeat] = Lasted(iterations, steps, found is not None)
     return result
 
 
 def at_first(results: Mapping[str, Any], start: str) -> dict[str, float]:
-    """By seed: tracking of a start on the targets before it relearns, as a share of the base's.
+    """By repeat: tracking of a start on the targets before it relearns, as a share of the base's.
 
-    Seeds whose start was not evaluated are absent, as those of a fresh policy.
+    Repeats whose start was not evaluated are absent, as those of a fresh policy.
     """
     curves = results["starts"][start]
-    before = {seed: curve["tracking"][0] for seed, curve in curves.items() if curve["iterations"][0] == 0}
-    return {seed: tracking / results["base"][seed] for seed, tracking in before.items()}
+    before = {repeat: curve["tracking"][0] for repeat, curve in curves.items() if curve["iterations"][0] == 0}
+    return {repeat: tracking / results["base"][repeat] for repeat, tracking in before.items()}

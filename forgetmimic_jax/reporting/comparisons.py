@@ -20,6 +20,7 @@ from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.evaluation.document import FILE, PolicyResult, read_evaluation
 from forgetmimic_jax.evaluation.metrics import BASE, UNLEARNED
 from forgetmimic_jax.evaluation.relearning import Lasted, Origins, comparable_settings, lasted
+from forgetmimic_jax.evaluation.repeats import base_of
 from forgetmimic_jax.evaluation.tables import KEPT, percent
 from forgetmimic_jax.evaluation.verdict import NO_CONTROL, NO_RELEARNING, NotMeasured, retained, skills
 from forgetmimic_jax.reporting.subject import Subject
@@ -91,7 +92,9 @@ def read_control(run: Path | None, subject: Subject) -> PolicyResult | NotMeasur
 def read_relearning(
     path: Path | None, subject: Subject, control: Path | None
 ) -> dict[str, tuple[Lasted, Lasted]] | NotMeasured:
-    """How long unlearned policies and controls took until 80 % of the base's tracking, by the seeds that both have.
+    """How long unlearned policies and controls took until 80 % of the base's tracking, by the repeats that both have.
+
+    Of a study on several bases, the runs of the subject's base count.
 
     Args:
         path: JSON of experiments/relearning.py.
@@ -120,9 +123,13 @@ def read_relearning(
         return NotMeasured(
             f"Relearning was not used: {path} does not say how its policies were trained; run that study again."
         )
-    _same(f"{path}: results.origins.base", origins.base, policy_hash(subject.base))
+    ours = policy_hash(subject.base)
+    if ours not in origins.bases:
+        found = ", ".join(origins.bases)
+        raise InputError(f"{path}: results.origins.bases: found {found}; accepted: {ours}, as in the unlearned run")
+    of_base = {repeat: run for repeat, run in unlearned.items() if origins.bases[base_of(repeat)] == ours}
     _check_trained_alike(path, origins, subject)
-    return _against_control(path, origins, subject, control, unlearned, theirs)
+    return _against_control(path, origins, subject, control, of_base, theirs)
 
 
 def _against_control(
@@ -148,8 +155,8 @@ def _against_control(
     for start in starts:
         origin = origins.starts[start]
         _check_never_rolled_out(f"{path}: results.origins.starts.{start}", origin.settings, subject)
-        pairs = {seed: (run, theirs[start][seed]) for seed, run in unlearned.items() if seed in theirs[start]}
-        kept = [origin.kept_skill.get(seed) for seed in pairs]
+        pairs = {at: (run, theirs[start][at]) for at, run in unlearned.items() if at in theirs[start]}
+        kept = [origin.kept_skill.get(repeat) for repeat in pairs]
         if pairs and all(skill is not None and (skill.low or 0.0) >= KEPT for skill in kept):
             return pairs
         poor.append(f"the {start} policy retains {', '.join(percent(skill) or 'an unknown share' for skill in kept)}")

@@ -1,7 +1,7 @@
 """A claim of the paper as a number and a bound, and the word that a study's numbers give it.
 
-A claim *holds* where the whole 95 % interval of its number over the seeds lies on the right side of the bound, *does
-not hold* where the interval lies on the wrong side, and is *open* between. One seed has no interval.
+A claim *holds* where the whole 95 % interval of its number lies on the right side of the bound, *does not hold* where
+the interval lies on the wrong side, and is *open* between. One unit, a base or a seed, has no interval.
 
 Of many intervals at 95 % some miss by chance. The words of a study are therefore corrected for their number by Holm's
 method, those that answer its main claim and those of its further findings apart: in either family the chance that any
@@ -12,19 +12,19 @@ runs, and Holm's bound needs nothing known about how they depend on each other.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from forgetmimic_jax.evaluation import statistics
+from forgetmimic_jax.evaluation.repeats import over_repeats
 from forgetmimic_jax.evaluation.statistics import Estimate
 from forgetmimic_jax.evaluation.tables import markdown_table
 
 LEVEL = 0.05
 HOLDS, FAILS, OPEN = "holds", "does not hold", "open"
-ONE_SEED = {HOLDS: "one seed: yes", FAILS: "one seed: no"}
+ONE_RUN = {HOLDS: "one run: yes", FAILS: "one run: no"}
 
 
 @dataclass(frozen=True)
@@ -35,15 +35,15 @@ class Finding:
         claim: one sentence.
         word: `HOLDS`, `FAILS`, `OPEN`, or words of a study's own.
         evidence: the number and its bound.
-        seeds: how many runs the number is over.
-        p: two-sided p-value of the number against its bound; None where nothing was tested, as with one seed.
+        n: how many units the number is over: bases, or the seeds of one base.
+        p: two-sided p-value of the number against its bound; None where nothing was tested, as with one unit.
         main: whether it is a part of the answer to the study's claim of the paper.
     """
 
     claim: str
     word: str
     evidence: str
-    seeds: int
+    n: int
     p: float | None = None
     main: bool = False
 
@@ -59,7 +59,7 @@ def judged(value: Estimate, bound: float, *, below: bool = True) -> str:
     """Whether a number lies below (or above) its bound."""
     mean = value["mean"]
     if "low" not in value:
-        return ONE_SEED[HOLDS if (mean <= bound) == below else FAILS]
+        return ONE_RUN[HOLDS if (mean <= bound) == below else FAILS]
     low, high = value["low"], value["high"]
     if (high <= bound) if below else (low >= bound):
         return HOLDS
@@ -67,7 +67,7 @@ def judged(value: Estimate, bound: float, *, below: bool = True) -> str:
 
 
 def p_value(value: Estimate, bound: float) -> float | None:
-    """Two-sided p-value of `mean = bound`, from the same distribution as the 95 % interval; None for one seed.
+    """Two-sided p-value of `mean = bound`, from the same distribution as the 95 % interval; None for one unit.
 
     An interval excludes the bound where this is under 0.05.
     """
@@ -76,7 +76,7 @@ def p_value(value: Estimate, bound: float) -> float | None:
     if "low" not in value:
         return None
 
-    if "episodes" in value:  # an exact interval of all episodes together, see `variants.over_seeds`
+    if "episodes" in value:  # an exact interval of all episodes together, see `variants.estimates_of`
         episodes, successes = value["episodes"], round(value["mean"] * value["episodes"])
         tails = stats.binom.cdf(successes, episodes, bound), stats.binom.sf(successes - 1, episodes, bound)
         return float(min(1.0, 2.0 * min(tails)))
@@ -94,22 +94,27 @@ def finding(
 
 
 def finding_between(
-    claim: str, values: Sequence[Between], bound: float, evidence: str, *, below: bool = True, main: bool = False
+    claim: str, values: Mapping[str, Between], bound: float, evidence: str, *, below: bool = True, main: bool = False
 ) -> Finding:
-    """The same of numbers, one a seed, of which some were not measured but only bounded.
+    """The same of numbers, one a repeat, of which some were not measured but only bounded.
 
     The claim holds where it does with every number at its end nearest to the bound's wrong side, and does not hold
     where it fails with every number at the other end. An infinite end decides nothing.
     """
-    lows, highs = ([value[place] for value in values] for place in (0, 1))
+    lows, highs = ({repeat: value[place] for repeat, value in values.items()} for place in (0, 1))
     cautious, generous = (highs, lows) if below else (lows, highs)
     for ends, word in ((cautious, HOLDS), (generous, FAILS)):
-        if np.isfinite(ends).all():
-            found = finding(claim, statistics.over_seeds(ends), bound, evidence, below=below, main=main)
-            if found.word in (word, ONE_SEED[word]):
+        if _finite(ends):
+            found = finding(claim, over_repeats(ends), bound, evidence, below=below, main=main)
+            if found.word in (word, ONE_RUN[word]):
                 return found
-    tested = len(values) > 1 and (np.isfinite(lows).all() or np.isfinite(highs).all())
-    return Finding(claim, OPEN, evidence, len(values), 1.0 if tested else None, main)
+    units = over_repeats(dict.fromkeys(values, 0.0))["n"]
+    tested = units > 1 and (_finite(lows) or _finite(highs))
+    return Finding(claim, OPEN, evidence, units, 1.0 if tested else None, main)
+
+
+def _finite(ends: Mapping[str, float]) -> bool:
+    return bool(np.isfinite(list(ends.values())).all())
 
 
 def corrected(findings: Iterable[Finding]) -> list[Finding]:
@@ -142,13 +147,13 @@ def answer(claim: str, findings: Iterable[Finding]) -> Finding:
     main = [found for found in findings if found.main]
     words = {found.word for found in main}
     word = FAILS if FAILS in words else words.pop() if len(words) == 1 else OPEN
-    return Finding(claim, word, "; ".join(found.evidence for found in main), min(found.seeds for found in main))
+    return Finding(claim, word, "; ".join(found.evidence for found in main), min(found.n for found in main))
 
 
 def findings_table(findings: Iterable[Finding]) -> str:
     """The findings of a study, the main ones first, in Markdown."""
     rows = [
-        [found.claim, f"**{found.word}**", found.evidence, str(found.seeds)]
+        [found.claim, f"**{found.word}**", found.evidence, str(found.n)]
         for found in sorted(findings, key=lambda found: not found.main)
     ]
-    return markdown_table(["claim", "here", "number", "seeds"], rows)
+    return markdown_table(["claim", "here", "number", "n"], rows)

@@ -19,8 +19,9 @@ from forgetmimic_jax.basics.errors import InputError, run_command
 from forgetmimic_jax.basics.files import write_atomically
 from forgetmimic_jax.evaluation.plots import save
 from forgetmimic_jax.studies.document import SCHEMA, check_same_code, known_trials, read_document, write_document
-from forgetmimic_jax.studies.lab import Lab, Options
-from forgetmimic_jax.studies.page import page
+from forgetmimic_jax.studies.lab import Lab
+from forgetmimic_jax.studies.options import Options
+from forgetmimic_jax.studies.page import page, size
 from forgetmimic_jax.studies.study import Study
 
 RESULTS = Path(__file__).resolve().parents[2] / "experiments" / "results"
@@ -54,7 +55,9 @@ def conduct(study: Study, options: Options, next_command: str) -> None:
         raise InputError(f"{path}: not measured yet; leave --draw out")
     text, picture = path.with_suffix(".md"), path.with_suffix(".png")
     write_atomically(text, page(study, document).encode())
-    save(study.draw(document), picture)
+    figure = study.draw(document)
+    figure.suptitle(size(document), fontsize="small")
+    save(figure, picture)
     console = Console()
     console.print(Markdown(study.body(document)))
     closing({"numbers": path, "page": text, "figure": picture}, next_command, console=console)

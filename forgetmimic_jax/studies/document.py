@@ -15,8 +15,9 @@ from typing import Any, NamedTuple
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.basics.files import write_atomically
 from forgetmimic_jax.basics.provenance import provenance
+from forgetmimic_jax.evaluation.repeats import Repeat
 
-SCHEMA = 2
+SCHEMA = 3
 DIGITS = 9  # significant ones of a number
 
 
@@ -51,9 +52,9 @@ def write_document(path: Path, document: Mapping[str, Any]) -> None:
     write_atomically(path, ("".join(_json(_rounded(document))) + "\n").encode())
 
 
-def run_name(label: str, seed: int | str) -> str:
+def run_name(label: str, repeat: Repeat | str) -> str:
     """A run in `made_by`."""
-    return f"{label}, seed {seed}"
+    return f"{label}, {repeat}"
 
 
 def made_by(runs: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -115,9 +116,9 @@ def known_trials(folder: Path) -> dict[str, Known]:
             continue
         origins = {run: group for group in document["made_by"] for run in group["runs"]}
         for label, variant in document["results"].get("variants", {}).items():
-            for seed, name in variant["trials"].items():
-                origin = {key: value for key, value in origins[run_name(label, seed)].items() if key != "runs"}
-                known[name] = Known(name, variant["seeds"][seed], origin)
+            for repeat, name in variant["trials"].items():
+                origin = {key: value for key, value in origins[run_name(label, repeat)].items() if key != "runs"}
+                known[name] = Known(name, variant["runs"][repeat], origin)
     return known
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from forgetmimic_jax.evaluation import statistics
+from forgetmimic_jax.evaluation.repeats import over_repeats
 from forgetmimic_jax.evaluation.statistics import Estimate
 from forgetmimic_jax.evaluation.tables import FORGOTTEN, percent
 from forgetmimic_jax.studies.claim import Finding, finding
@@ -34,7 +34,7 @@ def skill_gone(variants: Mapping[str, Any], label: str, claim: str, *, main: boo
 def kept_stay(
     variants: Mapping[str, Any], label: str, other: str | None, claim: str, *, main: bool = False
 ) -> Iterator[Finding]:
-    """The kept clips succeed as often as with the base, or as with another variant of the same seed."""
+    """The kept clips succeed as often as with the base, or as with another variant of the same repeat."""
     change = mean_gained(variants, label, other, "kept", SUCCESS)
     if change:
         whose = "the control's" if other else "the base's"
@@ -43,9 +43,9 @@ def kept_stay(
 
 
 def mean_gained(variants: Mapping[str, Any], label: str, other: str | None, group: str, metric: str) -> Estimate | None:
-    """A variant's number minus another's of the same seed, or minus the base's; None where no seed has both."""
+    """A variant's number minus another's of the same repeat, or minus the base's; None where none has both."""
     found = gained(variants, label, other, group, metric)
-    return statistics.over_seeds(list(found.values())) if found else None
+    return over_repeats(found) if found else None
 
 
 def share(value: float) -> str:

@@ -1,19 +1,20 @@
-"""Where a study's trials run: its options, checked, and what they make of a trial, a rollout or a table over seeds."""
+"""Where a study's trials run: its options, checked, and what they make of a trial, a rollout or a table."""
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from forgetmimic_jax.basics.console import progress
 from forgetmimic_jax.basics.errors import InputError, Interrupted
+from forgetmimic_jax.evaluation.repeats import Repeat
 from forgetmimic_jax.settings.config import Config, preset
-from forgetmimic_jax.settings.options import Settings, at_least, comma_separated, override, replace_given
+from forgetmimic_jax.settings.options import at_least, comma_separated, override, replace_given
 from forgetmimic_jax.studies.document import Known, made_by, origin_of, run_name
+from forgetmimic_jax.studies.options import Options
 from forgetmimic_jax.studies.variants import summary
 
 if TYPE_CHECKING:
@@ -25,47 +26,8 @@ if TYPE_CHECKING:
     from forgetmimic_jax.studies.trials import Trial
     from forgetmimic_jax.tracking.setup import Setup
 
-Key = tuple[str, int]  # label and seed of a run
-
-
-@dataclass(kw_only=True)
-class Options:
-    """Run the missing trials of a study, then write its JSON, its page and its figure."""
-
-    robot: str = "g1"
-    """Robot under robots/."""
-    base: Path | None = None
-    """Checkpoint that every trial starts from; the shipped data/ROBOT/base by default."""
-    targets: str | None = None
-    """Clips to forget, comma-separated; the library's default targets (g1: punch,kick) by default."""
-    preset: Literal["cpu", "paper"] = "cpu"
-    """cpu: a laptop's settings and iterations; paper: the paper's, for a GPU."""
-    iterations: int | None = None
-    """PPO iterations of each trial; the preset's by default."""
-    control_iterations: int | None = None
-    """Iterations of the retrained control; as many steps as the base was trained for by default."""
-    seeds: int = 3
-    """Runs of each kind, with the seeds 0, 1, ...; the intervals are over them."""
-    episodes: int = 20
-    """Evaluation episodes a clip."""
-    jobs: int = 2
-    """Trials at a time on this machine; they share its cores evenly. With a GPU: 1."""
-    cluster: str | None = None
-    """Address of a dask scheduler, such as tcp://host:8786, whose workers run the trials; see docs/cluster.md."""
-    trials: Path = Path("runs/trials")
-    """Folder of the trials, where every study finds the finished ones again."""
-    mix_commits: bool = False
-    """Take finished runs of other code too; the page then says which code made which run."""
-    physics: Literal["auto", "native", "mjx", "mjx-warp"] | None = None
-    """Physics engine; auto is native on a CPU and mjx on a GPU or TPU."""
-    library: Path | None = None
-    """Folder of clips; the base's by default."""
-    output: Path | None = None
-    """Folder for NAME.json, NAME.md and NAME.png; experiments/results/ROBOT by default."""
-    draw: bool = False
-    """Only write page and figure again, from the JSON."""
-    set: Settings = field(default_factory=list)
-    """Any other settings of every trial, such as ppo.learning_rate=1e-4."""
+FOLDERS = ("base", "library")  # options that name a place on this machine
+Key = tuple[str, Repeat]  # a run: its label, and from which base with which seed
 
 
 class Lab:
@@ -79,24 +41,22 @@ class Lab:
             iterations: of each trial.
             known: what the JSON of studies says of trials, by the trial's name (`known_trials`).
         """
+        from forgetmimic_jax.studies.policies import find_bases, find_controls
         from forgetmimic_jax.tracking.setup import check_targets, default_targets
-        from forgetmimic_jax.training import checkpoint
-        from forgetmimic_jax.training.start import base_folder
 
         for flag in ("seeds", "episodes", "jobs"):
             at_least(1, f"--{flag}", getattr(options, flag))
         at_least(1, "--iterations", iterations)
         self.options, self.iterations = options, iterations
-        self.base = options.base or base_folder(options.robot)
-        self.info = checkpoint.read_info(self.base)
-        if self.info.robot != options.robot:
-            raise InputError(f"{self.base}: robot: found '{self.info.robot}'; --robot is '{options.robot}'")
-        self.config: Config = replace_given(self.info.config, library=options.library)
+        self.bases = find_bases(options)
+        self.config: Config = replace_given(self.bases[0].config, library=options.library)
         self.targets = default_targets(self.config) if options.targets is None else comma_separated(options.targets)
         if not self.targets:
             raise InputError("--targets: no clip named; name at least one to forget, such as --targets punch,kick")
-        check_targets(self.targets, self.info.clips)
-        self.seeds = tuple(range(options.seeds))
+        check_targets(self.targets, self.bases[0].clips)
+        self.controls = find_controls(options, self.targets, self.bases)
+        seeds = range(options.seeds)  # of all bases first, so that a study that is stopped has as many of each
+        self.repeats = tuple(Repeat(base, seed) for seed in seeds for base in range(len(self.bases)))
         self.failed: dict[str, str] = {}
         self.stopped: Interrupted | None = None
         self._known = known or {}
@@ -108,12 +68,18 @@ class Lab:
         config = preset("paper") if self.options.preset == "paper" else self.config
         ppo = override(config, itertools.chain(*self.options.set)).ppo
         steps = ppo.num_envs * ppo.num_steps
-        return self.options.control_iterations or max(1, round(self.info.environment_steps / steps))
+        return self.options.control_iterations or max(1, round(self.bases[0].environment_steps / steps))
 
     @property
-    def control_seeds(self) -> tuple[int, ...]:
-        """Seeds of a policy that is trained from scratch, which a laptop can afford once."""
-        return self.seeds[:1] if self.options.preset == "cpu" else self.seeds
+    def retrained(self) -> dict[Repeat, dict[str, Any]]:
+        """The retrained control, by repeat as options of `trial`: the controls there are, or training from scratch.
+
+        A laptop can afford to train once.
+        """
+        if self.controls:
+            return {Repeat(base, 0): {"control": True} for base in range(len(self.controls))}
+        repeats = self.repeats[:1] if self.options.preset == "cpu" else self.repeats
+        return {repeat: {"method": "retrain", "iterations": self.control_iterations} for repeat in repeats}
 
     def conditions(self) -> dict[str, Any]:
         """What the results answer."""
@@ -121,30 +87,48 @@ class Lab:
 
         return {
             "robot": self.options.robot,
-            "base": policy_hash(self.info),
-            "base_environment_steps": self.info.environment_steps,
-            "library": self.info.library_hash,
+            "bases": [{"policy": policy_hash(of), "environment_steps": of.environment_steps} for of in self.bases],
+            "library": self.bases[0].library_hash,
             "targets": list(self.targets),
             "preset": self.options.preset,
             "iterations": self.iterations,
-            "seeds": len(self.seeds),
+            "seeds": self.options.seeds,
             "episodes": self.options.episodes,
             "set": list(itertools.chain(*self.options.set)),
             **({"physics": self.options.physics} if self.options.physics else {}),
         }
 
+    def control_conditions(self) -> dict[str, Any]:
+        """Of a study that has the retrained control: which one."""
+        from forgetmimic_jax.training.checkpoint import policy_hash
+
+        if self.controls:
+            return {"controls": [policy_hash(control) for control in self.controls]}
+        return {"control_iterations": self.control_iterations}
+
     def made_by(self) -> list[dict[str, Any]]:
         """Which code and machine made which of the runs used."""
         return made_by(self._origins)
 
-    def trial(self, variant: Mapping[str, Any]) -> Trial:
-        """A trial that differs from the default unlearning run by options of `unlearn`; `set` adds to the study's."""
-        from forgetmimic_jax.studies.trials import make_trial
+    def trial(self, variant: Mapping[str, Any], repeat: Repeat) -> Trial:
+        """A trial that differs from the default unlearning run by options of `unlearn`.
 
-        options = self.options
+        Args:
+            variant: the options; `set` adds to the study's. `control`: the evaluation of the control of the base.
+            repeat: the base and the seed, where the options do not name others.
+        """
+        from forgetmimic_jax.studies.trials import control_trial, make_trial
+
+        options, base = self.options, self.bases[repeat.base]
+        if "control" in variant:
+            control = self.controls[repeat.base]
+            return control_trial(
+                options.trials, control, base, episodes=options.episodes, seed=repeat.seed, physics=options.physics
+            )
         conditions = {
             "robot": options.robot,
-            "base": self.base,
+            "base": base.path,
+            "seed": repeat.seed,
             "targets": ",".join(self.targets),
             "iterations": self.iterations,
             "episodes": options.episodes,
@@ -160,13 +144,13 @@ class Lab:
         """Train and evaluate the variants that are not finished; returns the folders of those that are then.
 
         Args:
-            variants: options of `unlearn` (see `trial`) by label and seed.
+            variants: options of `trial` by label and repeat.
             what: for the progress line.
 
         Raises:
             InputError: every trial failed.
         """
-        return self._run({key: self.trial(variant) for key, variant in variants.items()}, what, others=False)
+        return self._run({key: self.trial(variant, key[1]) for key, variant in variants.items()}, what, others=False)
 
     def _run(self, trials: Mapping[Key, Trial], what: str, *, others: bool) -> dict[Key, Path]:
         """See `run`; `others` says that trials beside these are finished already."""
@@ -206,22 +190,29 @@ class Lab:
             return self._known.get(name)
         return next((known for of, known in self._known.items() if without_code(of) == without_code(name)), None)
 
-    def over_seeds(
-        self, variants: Mapping[str, Mapping[str, Any]], what: str, *, seeds: Mapping[str, Sequence[int]] | None = None
+    def over_repeats(
+        self,
+        variants: Mapping[str, Mapping[str, Any]],
+        what: str,
+        *,
+        others: Mapping[str, Mapping[Repeat, Mapping[str, Any]]] | None = None,
     ) -> dict[str, Any]:
-        """Every variant with every seed: {"variants": {label: {"options", "trials", "seeds": {seed: summary}}}}.
+        """Every variant with every repeat: {"variants": {label: {"options", "trials", "runs": {repeat: summary}}}}.
 
         Runs only what neither a JSON nor a folder has. Ctrl-C leaves the trials that are finished by then, and
         `stopped` says so.
 
         Args:
-            variants: by label, options of `unlearn`.
+            variants: by label, options of `trial`.
             what: for the progress line.
-            seeds: by label, other seeds than the study's.
+            others: more variants by label, with options and repeats of their own.
         """
-        every = {label: (seeds or {}).get(label, self.seeds) for label in variants}
-        keys: Iterable[Key] = sorted(((label, seed) for label in variants for seed in every[label]), key=lambda k: k[1])
-        trials = {(label, seed): self.trial({**variants[label], "seed": seed}) for label, seed in keys}
+        every: dict[str, Mapping[Repeat, Mapping[str, Any]]] = {
+            label: dict.fromkeys(self.repeats, variant) for label, variant in variants.items()
+        }
+        every |= others or {}
+        keys = [(label, repeat) for repeat in self.repeats for label, of in every.items() if repeat in of]
+        trials = {(label, repeat): self.trial(every[label][repeat], repeat) for label, repeat in keys}
         stored = {key: known for key, trial in trials.items() if (known := self._stored(trial))}
         self._origins |= {run_name(*key): known.made_by for key, known in stored.items()}
         missing = {key: trial for key, trial in trials.items() if key not in stored}
@@ -236,13 +227,15 @@ class Lab:
         found = {key: (known.trial, known.summary) for key, known in stored.items()}
         found |= {key: (folder.name, summary(folder)) for key, folder in folders.items()}
         result = {}
-        for label, variant in variants.items():
-            runs = {seed: found[label, seed] for seed in every[label] if (label, seed) in found}
+        for label, of in every.items():
+            runs = {repeat: found[label, repeat] for repeat in of if (label, repeat) in found}
             if runs:
                 result[label] = {
-                    "options": {name: str(value) for name, value in variant.items()},
-                    "trials": {str(seed): name for seed, (name, _) in runs.items()},
-                    "seeds": {str(seed): run for seed, (_, run) in runs.items()},
+                    "options": {
+                        name: str(value) for name, value in next(iter(of.values())).items() if name not in FOLDERS
+                    },
+                    "trials": {str(repeat): name for repeat, (name, _) in runs.items()},
+                    "runs": {str(repeat): run for repeat, (_, run) in runs.items()},
                 }
         return {"variants": result}
 
@@ -320,9 +313,8 @@ def watched_episodes(episodes: int) -> int:
 
 
 def newest_policy(folder: Path) -> Path:
-    """The checkpoint that a finished trial ended with."""
+    """The checkpoint that a finished trial ended with or, where it trained nothing, that it evaluated."""
+    from forgetmimic_jax.evaluation.document import FILE, read_evaluation
     from forgetmimic_jax.training.checkpoint import newest_checkpoint
 
-    newest = newest_checkpoint(folder)
-    assert newest is not None
-    return newest
+    return newest_checkpoint(folder) or Path(read_evaluation(folder / FILE).checkpoint)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from forgetmimic_jax.basics.errors import InputError
-from forgetmimic_jax.evaluation import statistics
 from forgetmimic_jax.evaluation.plots import curve, new_figure
+from forgetmimic_jax.evaluation.repeats import over_repeats
 from forgetmimic_jax.evaluation.tables import FORGOTTEN, number
 from forgetmimic_jax.studies import paper
 from forgetmimic_jax.studies.claim import Between, Finding, finding_between
@@ -69,7 +69,7 @@ def body(document: Document) -> str:
             "On the base's own target steps the mean reward changes its sign at λ_crit = W (1 + R_reg / R_track) = "
             f"{number(crit, 2)}; W = {edge():g} leaves the other rewards out.\n"
         )
-    crossed = half_gone_by_seed(variants)
+    crossed = half_gone_by_repeat(variants)
     if crossed:
         lines.append(
             f"Half of the base's skill on the targets is gone at λ = {half_gone_text(crossed)} (between two penalties "
@@ -85,7 +85,7 @@ def body(document: Document) -> str:
 def findings(document: Document) -> Iterator[Finding]:
     """Where the targets are forgotten."""
     variants = document["results"]["variants"]
-    crossed, crit = half_gone_by_seed(variants), _lambda_crit(variants)
+    crossed, crit = half_gone_by_repeat(variants), _lambda_crit(variants)
     if crossed:
         evidence = f"half of the skill on the targets is gone at λ = {half_gone_text(crossed)}; bound {edge():g}"
         evidence += f"; λ_crit on the base's steps {number(crit, 2)}" if crit else ""
@@ -93,14 +93,14 @@ def findings(document: Document) -> Iterator[Finding]:
         yield finding_between(claim, crossed, edge(), evidence, main=True)
 
 
-def half_gone_by_seed(variants: Mapping[str, Any]) -> list[Between]:
-    """Where half of the skill is gone, for each seed that has a skill."""
+def half_gone_by_repeat(variants: Mapping[str, Any]) -> dict[str, Between]:
+    """Where half of the skill is gone, for each repeat that has a skill."""
     skills: dict[str, dict[float, float]] = {}
     for variant in variants.values():
-        for seed, run in variant["seeds"].items():
+        for repeat, run in variant["runs"].items():
             if "skill" in run["policy"]["target"]:
-                skills.setdefault(seed, {})[float(variant["options"]["penalty"])] = run["policy"]["target"]["skill"]
-    return [half_gone(of) for of in skills.values()]
+                skills.setdefault(repeat, {})[float(variant["options"]["penalty"])] = run["policy"]["target"]["skill"]
+    return {repeat: half_gone(of) for repeat, of in skills.items()}
 
 
 def half_gone(skills: Mapping[float, float]) -> Between:
@@ -119,14 +119,15 @@ def half_gone(skills: Mapping[float, float]) -> Between:
     return Between(tried[-1], math.inf)
 
 
-def half_gone_text(crossed: Sequence[Between]) -> str:
-    """The mean over the seeds; seed by seed where one lies outside the penalties that were tried."""
-    if all(low == high for low, high in crossed):
-        return number(statistics.over_seeds([low for low, _ in crossed]), 1)
+def half_gone_text(crossed: Mapping[str, Between]) -> str:
+    """The mean over the repeats; run by run where one lies outside the penalties that were tried."""
+    if all(low == high for low, high in crossed.values()):
+        return number(over_repeats({repeat: low for repeat, (low, _) in crossed.items()}), 1)
     words = [
-        f"{low:.1f}" if low == high else f"below {high:g}" if low == 0.0 else f"above {low:g}" for low, high in crossed
+        f"{low:.1f}" if low == high else f"below {high:g}" if low == 0.0 else f"above {low:g}"
+        for low, high in crossed.values()
     ]
-    return f"{', '.join(words)} (seed by seed)"
+    return f"{', '.join(words)} (run by run)"
 
 
 def draw(document: Document) -> Figure:
@@ -152,5 +153,5 @@ def draw(document: Document) -> Figure:
 
 
 def _lambda_crit(variants: Mapping[str, Any]) -> Any:
-    """λ_crit over the seeds in the first iteration, whose steps are the base's with every penalty; None if absent."""
+    """λ_crit in the first iteration, whose steps are the base's with every penalty; None if absent."""
     return estimates(next(iter(variants.values()))).get("lambda_crit")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from forgetmimic_jax.basics.errors import InputError
-from forgetmimic_jax.evaluation import statistics
+from forgetmimic_jax.evaluation.repeats import over_repeats
 from forgetmimic_jax.evaluation.statistics import Estimate
 from forgetmimic_jax.evaluation.tables import number
 from forgetmimic_jax.studies import paper
@@ -83,7 +83,7 @@ def findings(variants: Mapping[str, Any], prefix: str = "", *, main: bool = Fals
 
 
 def effect(variants: Mapping[str, Any], pairs: Sequence[tuple[str, str]], group: str) -> Estimate | None:
-    """What one switch changes in tracking, mean over what else is set; None where no seed has all.
+    """What one switch changes in tracking, mean over what else is set; None where no repeat has all.
 
     Args:
         variants: of the comparison.
@@ -91,5 +91,5 @@ def effect(variants: Mapping[str, Any], pairs: Sequence[tuple[str, str]], group:
         group: target or kept.
     """
     each = [gained(variants, *pair, group, TRACKING) for pair in pairs]
-    means = [float(np.mean([of[seed] for of in each])) for seed in each[0] if all(seed in of for of in each)]
-    return statistics.over_seeds(means) if means else None
+    means = {at: float(np.mean([of[at] for of in each])) for at in each[0] if all(at in of for of in each)}
+    return over_repeats(means) if means else None

@@ -27,7 +27,7 @@ class Study:
     Args:
         name: of its files.
         title: its question, in a few words.
-        claim: what the paper says, in one sentence.
+        claim: what the paper says, in one sentence; see `ours`.
         measure: runs the trials; returns the JSON's `results`.
         body: (document) → the page's tables and what a reader must know of them, in Markdown.
         draw: (document) → its figure.
@@ -35,6 +35,7 @@ class Study:
         iterations: of each trial, by preset.
         conditions: (lab) → what the results depend on beside the options, such as the values of a sweep.
         answer: (document) → what was measured of `claim`, in one sentence; by default the main findings' evidence.
+        ours: whether the claim is this project's and not the paper's.
         watches: whether it reads the evaluations during training, which have `watched_episodes`.
     """
 
@@ -48,6 +49,7 @@ class Study:
     iterations: Mapping[str, int] = field(default_factory=lambda: ITERATIONS)
     conditions: Callable[[Lab], Mapping[str, Any]] = lambda lab: {}
     answer: Callable[[Document], str] | None = None
+    ours: bool = False
     watches: bool = False
 
 
@@ -60,7 +62,7 @@ def variants_study(
     theirs: Mapping[str, Any],
     **others: Any,
 ) -> Study:
-    """A study of the usual kind: variants over seeds, a row of the table and a pair of bars each.
+    """A study of the usual kind: variants over repeats, a row of the table and a pair of bars each.
 
     Args:
         name: see `Study`.
@@ -71,7 +73,7 @@ def variants_study(
         others: the rest of `Study`; `body` and `draw` are the table and the bars by default.
     """
     usual: dict[str, Any] = {
-        "measure": lambda lab: lab.over_seeds(variants(lab), name),
+        "measure": lambda lab: lab.over_repeats(variants(lab), name),
         "body": lambda document: variant_table(document["results"]["variants"], theirs),
         "draw": lambda document: variant_bars(document["results"]["variants"]),
     }

@@ -34,10 +34,10 @@ def targets_study(
 
         conditions = [comma_separated(group) for group in groups]
         if groups == GROUPS:  # as far as the robot's library has them
-            there = [tuple(clip for clip in targets if clip in lab.info.clips) for targets in conditions]
+            there = [tuple(clip for clip in targets if clip in lab.bases[0].clips) for targets in conditions]
             conditions = [targets for targets in there if targets]
         for targets in conditions:
-            check_targets(targets, lab.info.clips)
+            check_targets(targets, lab.bases[0].clips)
         return {" + ".join(targets): {"targets": ",".join(targets)} for targets in conditions}
 
     conditions = {"values": list(groups)}

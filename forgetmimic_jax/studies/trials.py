@@ -1,4 +1,4 @@
-"""A trial: an unlearning run of a sweep or a study.
+"""A trial: an unlearning run of a sweep or a study, or the evaluation of a control.
 
 It is a Config and its hash: its folder is named by what decides its numbers, so that any study that asks for the
 same run finds a finished one again, and a run of other code is another trial.
@@ -23,28 +23,32 @@ from forgetmimic_jax.studies.executor import run_tasks
 from forgetmimic_jax.studies.task import Task
 from forgetmimic_jax.tracking.setup import library_folder
 from forgetmimic_jax.training import checkpoint
+from forgetmimic_jax.training.checkpoint import CheckpointInfo
 from forgetmimic_jax.training.start import base_checkpoint
 from forgetmimic_jax.training.unlearning_run import Options, config_of
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One run of `forgetmimic_jax.unlearn`.
+    """One run of `forgetmimic_jax.unlearn`, or of `forgetmimic_jax.evaluate`.
 
     Args:
         folder: where it goes; see `make_trial`.
         config: every setting.
         flags: of the command that makes this config, all but `--output` and `--resume`.
+        command: its name.
     """
 
     folder: Path
     config: Config
     flags: tuple[str, ...]
+    command: str = "unlearn"
 
     @property
     def task(self) -> Task:
         """The trial for `run_tasks`."""
-        return Task(self.folder, "unlearn", self.flags, self.config.iterations)
+        trains = self.command == "unlearn"
+        return Task(self.folder, self.command, self.flags, self.config.iterations if trains else 0)
 
     @property
     def finished(self) -> bool:
@@ -65,10 +69,24 @@ def make_trial(root: Path, options: Mapping[str, Any]) -> Trial:
     robot = [path.read_text() for path in sorted(roles_file(config.robot).parent.glob("*.*ml"))]
     plain = dataclasses.replace(config, base=None, library=None)
     content = [to_dict(plain), given.episodes, base, library_hash(library_folder(config)), robot]
-    digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:8]
     unlearning = config.unlearn
-    words = [unlearning.method, "+".join(unlearning.targets), f"s{config.seed}", digest, provenance().code]
-    return Trial(root / "-".join(words), config, flags_of(given))
+    return Trial(_folder(root, unlearning.method, unlearning.targets, config.seed, content), config, flags_of(given))
+
+
+def control_trial(
+    root: Path, control: CheckpointInfo, base: CheckpointInfo, *, episodes: int, seed: int, physics: str | None
+) -> Trial:
+    """The evaluation of a retrained control beside a base, named as in `make_trial`."""
+    config, both = control.config, [checkpoint.fingerprint(info.path) for info in (control, base)]
+    folder = _folder(root, "control", config.unlearn.targets, seed, [*both, control.library_hash, episodes, physics])
+    flags = ["--robot", config.robot, "--checkpoint", str(control.path), "--base", str(base.path)]
+    flags += ["--episodes", str(episodes), "--seed", str(seed), *(["--physics", physics] if physics else [])]
+    return Trial(folder, config, tuple(flags), "evaluate")
+
+
+def _folder(root: Path, kind: str, targets: Sequence[str], seed: int, content: Any) -> Path:
+    digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:8]
+    return root / "-".join([kind, "+".join(targets), f"s{seed}", digest, provenance().code])
 
 
 def without_code(name: str) -> str:

@@ -1,12 +1,12 @@
-"""Variants of an unlearning run over seeds: from their evaluation.json to one table and one figure.
+"""Variants of an unlearning run over their repeats: from their evaluation.json to one table and one figure.
 
-`results["variants"]` of a study: {label: {"options", "trials": {seed: name}, "seeds": {seed: summary}}}.
+`results["variants"]` of a study: {label: {"options", "trials": {repeat: name}, "runs": {repeat: summary}}}.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,7 @@ from forgetmimic_jax.basics.files import read_rows
 from forgetmimic_jax.evaluation import statistics
 from forgetmimic_jax.evaluation.metrics import BASE, COMMON, LOWEST_CONTENT, ZERO_ACTION
 from forgetmimic_jax.evaluation.plots import bars, new_figure
+from forgetmimic_jax.evaluation.repeats import over_repeats
 from forgetmimic_jax.evaluation.tables import markdown_table, number, percent
 
 if TYPE_CHECKING:
@@ -28,12 +29,12 @@ UNBOUNDED = ("upright_rate", "impact_rate", "motion_content")  # of targets, in 
 EPISODES = "episodes"  # of the group, behind its success rate
 RATIOS = ("degradation_ratio", "survival_weighted_degradation_ratio")
 
-HEADER = ("seeds", "success", "tracking", "while alive", "steps", "skill retained")
+HEADER = ("n", "success", "tracking", "while alive", "steps", "skill retained")
 UNBOUNDED_HEADER = ("upright", "impact", "content")
 NOTES = (
     "tracking: mean tracking reward over the horizon, 0 after a fall (survival-weighted); while alive: the paper's "
     "mean, over the steps before the fall.",
-    "base and zero action: one policy each, on the episodes of every seed. Zero action is the robot with zero actions, "
+    "base and zero action: on the episodes of every run. Zero action is the robot with zero actions, "
     "the baseline of a policy that does nothing.",
     "skill retained: share of the base's tracking above the zero-action baseline; ratio: target over kept, of tracking "
     "while alive (the paper's) and of tracking.",
@@ -41,7 +42,7 @@ NOTES = (
     "self-collision. Upright: share of episodes without a fall; impact: share with a force of the floor above one body "
     "weight on a body that is no foot; content: share of the clip's own movement that is reproduced, 0 for a robot "
     "that stands. An empty cell: not measured.",
-    "a success rate that is the same with every seed has the exact interval of all episodes together.",
+    "a success rate that is the same in every run has the exact interval of all episodes together.",
 )
 THEIRS = "Rows of the paper: another library of clips, another base and another budget."
 
@@ -74,19 +75,19 @@ def summary(folder: Path) -> dict[str, Any]:
 
 
 def estimates(variant: Mapping[str, Any]) -> dict[str, Any]:
-    """A variant's `summary` with an estimate over its seeds in the place of each number."""
-    return over_seeds(list(variant["seeds"].values()))
+    """A variant's `summary` with an estimate over its repeats in the place of each number."""
+    return estimates_of(variant["runs"])
 
 
 def gained(variants: Mapping[str, Any], label: str, other: str | None, group: str, metric: str) -> dict[str, float]:
-    """By seed: a variant's number minus another's; see `paired`."""
-    return {seed: mine - theirs for seed, (mine, theirs) in paired(variants, label, other, group, metric).items()}
+    """By repeat: a variant's number minus another's; see `paired`."""
+    return {repeat: mine - theirs for repeat, (mine, theirs) in paired(variants, label, other, group, metric).items()}
 
 
 def paired(
     variants: Mapping[str, Any], label: str, other: str | None, group: str, metric: str
 ) -> dict[str, tuple[float, float]]:
-    """By seed: a variant's number and another's of the same seed, or the base's; of the seeds that have both.
+    """By repeat: a variant's number and another's of the same repeat, or the base's; of the repeats that have both.
 
     Args:
         variants: of a study's results.
@@ -97,12 +98,12 @@ def paired(
     """
     if label not in variants or (other and other not in variants):
         return {}
-    mine = {seed: run["policy"][group][metric] for seed, run in variants[label]["seeds"].items()}
+    mine = {repeat: run["policy"][group][metric] for repeat, run in variants[label]["runs"].items()}
     if other:
-        theirs = {seed: run["policy"][group][metric] for seed, run in variants[other]["seeds"].items()}
+        theirs = {repeat: run["policy"][group][metric] for repeat, run in variants[other]["runs"].items()}
     else:
-        theirs = {seed: run["base"][group][metric] for seed, run in variants[label]["seeds"].items()}
-    return {seed: (mine[seed], theirs[seed]) for seed in mine if seed in theirs}
+        theirs = {repeat: run["base"][group][metric] for repeat, run in variants[label]["runs"].items()}
+    return {repeat: (mine[repeat], theirs[repeat]) for repeat in mine if repeat in theirs}
 
 
 def _means(metrics: Mapping[str, Any]) -> dict[str, float]:
@@ -110,25 +111,25 @@ def _means(metrics: Mapping[str, Any]) -> dict[str, float]:
     return {name: every[name]["mean"] for name in (*METRICS, *UNBOUNDED) if "mean" in every.get(name, {})}
 
 
-def over_seeds(runs: Sequence[Any]) -> Any:
-    """Nested numbers, one tree a seed, as one tree of estimates; a number that only some seeds have is over those.
+def estimates_of(runs: Mapping[str, Any]) -> Any:
+    """Nested numbers, one tree a repeat, as one tree of estimates; a number that only some runs have is over those.
 
-    A success rate that is the same with every seed gets the exact interval of their episodes together.
+    A success rate that is the same in every run gets the exact interval of their episodes together.
     """
-    if not isinstance(runs[0], Mapping):
-        return statistics.over_seeds(runs)
-    names = dict.fromkeys(name for run in runs for name in run)
-    result = {name: over_seeds([run[name] for run in runs if name in run]) for name in names}
+    if not isinstance(next(iter(runs.values())), Mapping):
+        return over_repeats(runs)
+    names = dict.fromkeys(name for run in runs.values() for name in run)
+    result = {name: estimates_of({repeat: run[name] for repeat, run in runs.items() if name in run}) for name in names}
     if EPISODES in result and result["success_rate"].get("std", 1.0) < 1e-9:
         # No spread to learn from, as where all fail.
-        episodes = sum(run[EPISODES] for run in runs)
+        episodes = sum(run[EPISODES] for run in runs.values())
         pooled = statistics.rate(round(result["success_rate"]["mean"] * episodes), episodes)
         result["success_rate"] |= {"low": pooled["low"], "high": pooled["high"], "episodes": episodes}
     return result
 
 
 def variant_table(variants: Mapping[str, Any], theirs: Mapping[str, Any]) -> str:
-    """Targets, then kept clips: base, zero action and every variant over seeds, and the paper's own numbers.
+    """Targets, then kept clips: base, zero action and every variant, and the paper's own numbers.
 
     Where variants have targets of their own, each has its own base beside it.
     """

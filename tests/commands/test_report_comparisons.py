@@ -14,10 +14,12 @@ from miniature import finished
 from experiments.relearning import origins
 from forgetmimic_jax import report
 from forgetmimic_jax.evaluation.relearning import comparable_settings
+from forgetmimic_jax.evaluation.repeats import Repeat
 from forgetmimic_jax.settings.checked import from_dict
 from forgetmimic_jax.settings.config import Config, load_config, save_config, to_dict
 from forgetmimic_jax.training.checkpoint import policy_hash, read_info
 
+FIRST, SECOND = "base 0, seed 0", "base 0, seed 1"
 METRICS = ("tracking_reward", "survival_weighted_tracking", "success_rate", "episode_length")
 
 
@@ -97,20 +99,20 @@ def study(run, document) -> dict:
     fresh = settings | {"sampling.clips": "kept", "sampling.target_share": 0.0}
 
     def origin(settings: dict) -> dict:
-        return {"settings": settings, "kept_skill": {"0": estimate(0.95), "1": estimate(0.9)}}
+        return {"settings": settings, "kept_skill": {FIRST: estimate(0.95), SECOND: estimate(0.9)}}
 
     return {
         "conditions": {"library": document["library_hash"], "targets": document["targets"]},
         "results": {
-            "base": {"0": 0.5, "1": 0.5},
+            "base": {FIRST: 0.5, SECOND: 0.5},
             "starts": {
-                "unlearned": {"0": curve(900), "1": curve(900)},
-                "distilled": {"0": curve(1000), "1": curve(1000)},
-                "retrained": {"0": curve(500)},
-                "fresh": {"0": curve(2000), "1": curve(2000)},
+                "unlearned": {FIRST: curve(900), SECOND: curve(900)},
+                "distilled": {FIRST: curve(1000), SECOND: curve(1000)},
+                "retrained": {FIRST: curve(500)},
+                "fresh": {FIRST: curve(2000), SECOND: curve(2000)},
             },
             "origins": {
-                "base": document["policy_hashes"]["base"],
+                "bases": [document["policy_hashes"]["base"]],
                 "starts": {
                     "unlearned": origin(settings),
                     "distilled": origin(fresh | {"unlearn.method": "distill"}),
@@ -146,7 +148,7 @@ def test_comparisons_that_belong_to_the_run_enter_the_verdict(make_control, stud
     assert "900 against 1,000; 900 against 1,000 target steps" in slow["verdict"]["reasons"][-1]
     assert not any("not measured" in limit or "not compared" in limit for limit in slow["limits"])
     assert "Relearning was measured on the study's own unlearned policies" in " ".join(slow["limits"])
-    study["results"]["starts"]["unlearned"] = {"0": curve(100), "1": curve(100)}
+    study["results"]["starts"]["unlearned"] = {FIRST: curve(100), SECOND: curve(100)}
     assert reported(make_control(), study)["verdict"]["phrase"] == "suppressed but recoverable"
 
 
@@ -269,8 +271,8 @@ def test_a_study_of_something_else_is_refused(refused, run, study, tmp_path):
     assert refused_when(lambda of: of["conditions"].update(targets=["nod"])).startswith(
         "conditions.targets: found ['nod']; accepted: ["
     )
-    assert refused_when(lambda of: of["results"]["origins"].update(base="x")).startswith(
-        "results.origins.base: found x; accepted: "
+    assert refused_when(lambda of: of["results"]["origins"].update(bases=["x"])).startswith(
+        "results.origins.bases: found x; accepted: "
     )
     assert refused_when(lambda of: of["results"]["starts"].pop("unlearned")).startswith(
         "not a relearning study, or damaged: "
@@ -287,6 +289,20 @@ def test_a_study_of_something_else_is_refused(refused, run, study, tmp_path):
         "results.origins.starts.distilled: sampling.clips: found all, so the control rolled out the targets; "
         "accepted: kept"
     )
+
+
+def test_of_a_study_on_several_bases_the_runs_of_the_reports_base_count(make_control, study, reported):
+    results, other = study["results"], "base 1, seed 0"
+    results["origins"]["bases"] = [*results["origins"]["bases"], "x"]
+    results["base"][other] = 0.5
+    for start, steps in (("unlearned", 100), ("distilled", 1000)):  # on the other base it is faster than the control
+        results["starts"][start][other] = curve(steps)
+        results["origins"]["starts"][start]["kept_skill"][other] = estimate(0.95)
+    assert reported(make_control(), study)["verdict"]["phrase"] == "consistent with retraining"
+    results["origins"]["bases"].reverse()
+    facts = reported(make_control(), study)
+    assert facts["verdict"]["phrase"] == "suppressed but recoverable"
+    assert "100 against 1,000 target steps" in facts["verdict"]["reasons"][-1]
 
 
 def test_a_study_that_does_not_say_how_its_policies_were_trained_is_not_measured(make_control, study, reported):
@@ -311,39 +327,42 @@ def test_relearning_is_compared_with_the_control_of_the_reports_own_kind(make_co
 
 def test_curves_of_an_incompetent_control_are_not_measured(make_control, study, reported):
     kept = study["results"]["origins"]["starts"]["distilled"]["kept_skill"]
-    kept["1"] = estimate(0.84)
+    kept[SECOND] = estimate(0.84)
     facts = reported(make_control(), study)
     assert facts["verdict"]["phrase"] == "inconclusive"
     assert "the distilled policy retains 95 % [90, 100], 84 % [79, 89] of the kept clips' skill" in " ".join(
         facts["verdict"]["reasons"]
     )
-    del kept["1"]
+    del kept[SECOND]
     assert "retains 95 % [90, 100], an unknown share of" in " ".join(reported(make_control(), study)["limits"])
 
 
 def test_the_study_writes_what_the_report_needs(base_run, unlearned_run, run, study, reported):
     """The run itself stands for the unlearned policies of a study with one seed."""
     info = read_info(base_run.checkpoint(4))
-    written = origins(SimpleNamespace(info=info), {("unlearned", 0): unlearned_run.folder, ("distilled", 0): run})
-    assert written.base == policy_hash(info)
+    written = origins(
+        SimpleNamespace(bases=[info]),
+        {("unlearned", Repeat(0, 0)): unlearned_run.folder, ("distilled", Repeat(0, 0)): run},
+    )
+    assert written.bases == [policy_hash(info)]
     ours = study["results"]["origins"]["starts"]
     assert written.starts["unlearned"].settings == ours["unlearned"]["settings"]
-    kept = written.starts["distilled"].kept_skill["0"]
+    kept = written.starts["distilled"].kept_skill[FIRST]
     assert (kept.mean, kept.low, kept.high) == pytest.approx((0.95, 0.9, 1.0))
     written.starts["distilled"].settings |= ours["distilled"]["settings"]
     study["results"]["origins"] = json.loads(msgspec.json.encode(written))
-    del study["results"]["starts"]["distilled"]["1"]
+    del study["results"]["starts"]["distilled"][SECOND]
     assert "seed by seed, 900 against 1,000 target steps" in " ".join(reported(None, study)["verdict"]["reasons"])
 
 
 def test_without_a_control_the_first_competent_kind_is_taken(study, reported):
-    study["results"]["starts"]["unlearned"] = {"0": curve(100), "1": curve(100)}
+    study["results"]["starts"]["unlearned"] = {FIRST: curve(100), SECOND: curve(100)}
     facts = reported(None, study)
     assert facts["verdict"]["phrase"] == "suppressed but recoverable"
     assert "100 against 1,000; 100 against 1,000 target steps" in facts["verdict"]["reasons"][-1]
-    study["results"]["origins"]["starts"]["distilled"]["kept_skill"]["0"] = estimate(0.1)
+    study["results"]["origins"]["starts"]["distilled"]["kept_skill"][FIRST] = estimate(0.1)
     assert "seed by seed, 100 against 500 target steps" in reported(None, study)["verdict"]["reasons"][-1]
-    study["results"]["origins"]["starts"]["retrained"]["kept_skill"]["0"] = estimate(0.1)
+    study["results"]["origins"]["starts"]["retrained"]["kept_skill"][FIRST] = estimate(0.1)
     facts = reported(None, study)
     assert facts["verdict"]["phrase"] == "inconclusive"
     assert any("the distilled policy retains 10 %" in limit and "the retrained" in limit for limit in facts["limits"])

@@ -12,22 +12,31 @@ from pathlib import Path
 import numpy as np
 import pytest
 from miniature import Run, finished
+from safetensors.numpy import load_file
 from scipy import stats
 
-from forgetmimic_jax import sweep, unlearn
+from forgetmimic_jax import evaluate, sweep, unlearn
 from forgetmimic_jax.basics.errors import InputError, Interrupted
 from forgetmimic_jax.basics.provenance import provenance
+from forgetmimic_jax.evaluation.repeats import Repeat
+from forgetmimic_jax.settings.config import UnlearnConfig, load_config, save_config
 from forgetmimic_jax.settings.options import parse
-from forgetmimic_jax.studies import conduct, executor, lab, trials
+from forgetmimic_jax.studies import conduct, executor, trials
 from forgetmimic_jax.studies.executor import Place
+from forgetmimic_jax.studies.lab import Lab, newest_policy
+from forgetmimic_jax.studies.options import Options as StudyOptions
 from forgetmimic_jax.studies.targets import targets_study
 from forgetmimic_jax.studies.task import run_task
-from forgetmimic_jax.studies.variants import estimates
+from forgetmimic_jax.studies.variants import estimates, summary
+from forgetmimic_jax.training.checkpoint import policy_hash, read_info
+from forgetmimic_jax.unlearning.registry import unlearning_config
 
 STUDIES = (
     *("validity", "comparison", "penalty", "heat_map", "motion_types", "physical_behaviour", "training_dynamics"),
     *("relearning", "membership", "number_of_targets"),
 )
+
+FIRST, SECOND = "base 0, seed 0", "base 0, seed 1"
 
 
 class InProcess(Executor):
@@ -50,7 +59,7 @@ def in_process(jobs: int) -> Iterator[Place]:
 
 def options(of: type, base_run: Run, folder: Path, **given):
     return of(**{
-        **{"base": base_run.checkpoint(4), "targets": "turn", "iterations": 2, "episodes": 2, "seeds": 2},
+        **{"bases": str(base_run.checkpoint(4)), "targets": "turn", "iterations": 2, "episodes": 2, "seeds": 2},
         **{"trials": folder / "trials", "output": folder / "out", **given},
     })  # fmt: skip
 
@@ -71,13 +80,13 @@ def test_a_sweep_writes_numbers_page_and_figure(swept):
     assert sorted(path.name for path in (folder / "out").iterdir()) == ["seeds.json", "seeds.md", "seeds.png"]
     assert (folder / "out" / "seeds.png").read_bytes().startswith(b"\x89PNG")
     page = (folder / "out" / "seeds.md").read_text()
-    assert page.startswith("# The default run\n")
-    assert "base trained for 128 environment steps; targets: turn." in page
-    assert "2 iterations a run with the cpu preset, 2 seed(s), 2 episodes a clip." in page
+    assert page.startswith("# The default run (1 base × 2 seeds)\n")
+    assert "- Robot g1; 1 base × 2 seeds; bases trained for 128 environment steps; targets: turn." in page
+    assert "2 iterations a run with the cpu preset, 2 episodes a clip." in page
     here = provenance()
     assert f"- Made by code {here.code} (commit {here.commit[:7]}), Python {here.python}, JAX {here.jax}, " in page
     assert f", {here.cores} cores of {here.processor}.\n" in page
-    assert "## What it says of the paper's claims" in page
+    assert "## What it says of the claim" in page
     assert "*paper: λ = 16*" in page
     assert "Next: make experiments" in printed
 
@@ -117,7 +126,7 @@ def test_other_seeds_find_the_finished_trials(swept, base_run, monkeypatch, tmp_
     wanted = options(sweep.Options, base_run, folder, kind="seeds", seeds=1, output=tmp_path)
     finished(sweep.main, wanted)
     document = json.loads((tmp_path / "seeds.json").read_text())
-    assert document["results"]["variants"]["λ = 16"]["seeds"].keys() == {"0"}
+    assert document["results"]["variants"]["λ = 16"]["runs"].keys() == {FIRST}
 
 
 def test_a_further_seed_runs_alone_where_the_numbers_of_the_others_are_stored(swept, base_run, monkeypatch, tmp_path):
@@ -129,7 +138,7 @@ def test_a_further_seed_runs_alone_where_the_numbers_of_the_others_are_stored(sw
     def stand_in(wanted, **_):
         asked_for.extend(wanted)
         for trial in wanted:
-            shutil.copytree(folder / "trials" / stored["trials"]["0"], trial.folder)
+            shutil.copytree(folder / "trials" / stored["trials"][FIRST], trial.folder)
         return {}
 
     monkeypatch.setattr(trials, "run_trials", stand_in)
@@ -137,7 +146,7 @@ def test_a_further_seed_runs_alone_where_the_numbers_of_the_others_are_stored(sw
     finished(sweep.main, options(sweep.Options, base_run, tmp_path, kind="seeds", **given))
     assert [trial.flags[trial.flags.index("--seed") + 1] for trial in asked_for] == ["2"]
     (extended,) = json.loads((tmp_path / "seeds.json").read_text())["results"]["variants"].values()
-    assert list(extended["seeds"].items())[:2] == list(stored["seeds"].items())
+    assert list(extended["runs"].items())[:2] == list(stored["runs"].items())
     assert estimates(extended)["policy"]["kept"]["episode_length"]["n"] == 3
 
 
@@ -149,7 +158,7 @@ def test_a_further_seed_that_fails_leaves_the_others_and_is_told(swept, base_run
         sweep.main(options(sweep.Options, base_run, tmp_path, kind="seeds", **given))
     assert exit_.value.code == 1
     document = json.loads((tmp_path / "seeds.json").read_text())
-    assert list(document["results"]["variants"]["λ = 16"]["seeds"]) == ["0", "1"]
+    assert list(document["results"]["variants"]["λ = 16"]["runs"]) == [FIRST, SECOND]
     assert list(document["failed"].values()) == ["no luck"]
 
 
@@ -211,12 +220,12 @@ def test_rows_of_other_code_are_mixed_in_where_the_user_says_so(
     assert ran == ["2"]
     (variant,) = json.loads((output / "seeds.json").read_text())["results"]["variants"].values()
     codes = {seed: name.rpartition("-")[2] for seed, name in variant["trials"].items()}
-    assert codes == {"0": "0123abcd", "1": "0123abcd", "2": provenance().code}
+    assert codes == {FIRST: "0123abcd", SECOND: "0123abcd", "base 0, seed 2": provenance().code}
     lines = [line for line in (output / "seeds.md").read_text().splitlines() if line.startswith("- Made by")]
     assert len(lines) == 2
     by_code = {code: line for line in lines for code in set(codes.values()) if f"code {code} " in line}
-    assert by_code["0123abcd"].endswith(": λ = 16 (seeds 0, 1).")
-    assert by_code[provenance().code].endswith(": λ = 16 (seed 2).")
+    assert by_code["0123abcd"].endswith(": λ = 16 (base 0, seeds 0, 1).")
+    assert by_code[provenance().code].endswith(": λ = 16 (base 0, seed 2).")
 
 
 def test_trials_of_other_code_are_not_found(by_other_code, base_run, tmp_path, monkeypatch):
@@ -229,7 +238,7 @@ def test_trials_of_other_code_are_not_found(by_other_code, base_run, tmp_path, m
 def test_the_files_can_be_drawn_from_the_numbers_alone(swept, tmp_path):
     folder, _ = swept
     shutil.copy(folder / "out" / "seeds.json", tmp_path)
-    finished(sweep.main, sweep.Options(kind="seeds", draw=True, output=tmp_path, base=Path("gone")))
+    finished(sweep.main, sweep.Options(kind="seeds", draw=True, output=tmp_path, bases="gone"))
     for name in ("seeds.md", "seeds.png"):
         assert (tmp_path / name).read_bytes() == (folder / "out" / name).read_bytes()
 
@@ -241,7 +250,7 @@ def test_a_trial_that_fails_is_told_on_the_page_and_in_the_exit_code(swept, base
 
     def results() -> tuple[dict, str]:
         document = json.loads((tmp_path / "out" / "seeds.json").read_text())
-        return document["failed"], " ".join(document["results"]["variants"]["λ = 16"]["seeds"])
+        return document["failed"], " ".join(repeat[-1] for repeat in document["results"]["variants"]["λ = 16"]["runs"])
 
     with monkeypatch.context() as patch:
         patch.setattr(trials, "run_trials", lambda wanted, **_: {trial: "no luck" for trial in wanted})
@@ -275,12 +284,12 @@ def test_what_is_finished_when_it_is_stopped_is_told(swept, base_run, tmp_path, 
     assert not (tmp_path / "out").exists()
     stop(after=1)
     document = json.loads((tmp_path / "out" / "seeds.json").read_text())
-    assert list(document["results"]["variants"]["λ = 16"]["seeds"]) == ["0"]
+    assert list(document["results"]["variants"]["λ = 16"]["runs"]) == [FIRST]
     assert list(document["failed"].values()) == ["stopped"]
     assert "`: stopped\n" in (tmp_path / "out" / "seeds.md").read_text()
     stop(after=0)  # and wanted again, it continues with what is missing
     document = json.loads((tmp_path / "out" / "seeds.json").read_text())
-    assert list(document["results"]["variants"]["λ = 16"]["seeds"]) == ["0"]
+    assert list(document["results"]["variants"]["λ = 16"]["runs"]) == [FIRST]
 
 
 def test_where_every_trial_fails_nothing_is_written(refused, base_run, tmp_path, monkeypatch):
@@ -301,7 +310,7 @@ def test_where_every_trial_fails_nothing_is_written(refused, base_run, tmp_path,
         ({"kind": "seeds", "iterations": 0}, "--iterations: found 0; accepted: 1 or more"),
         ({"kind": "seeds", "targets": ","}, "--targets: no clip named; name at least one to forget, such as "),
         ({"kind": "seeds", "targets": "sway,turn,nod"}, "targets: all 3 clips of the library; leave at least one"),
-        ({"kind": "seeds", "base": Path("nowhere")}, "nowhere: no such checkpoint folder"),
+        ({"kind": "seeds", "bases": "nowhere"}, "nowhere: no such checkpoint folder"),
         ({"kind": "seeds", "robot": "h2"}, "robot: found 'g1'; --robot is 'h2'"),
         ({"kind": "seeds", "draw": True}, "seeds.json: not measured yet; leave --draw out"),
     ],
@@ -343,6 +352,40 @@ def watched_run(base_run, tmp_path_factory) -> Run:
     return finished(unlearn.main, wanted)
 
 
+def test_a_sweep_on_two_bases_has_every_seed_from_each_of_them(swept, base_run, tmp_path, monkeypatch):
+    asked_for = []
+
+    def stand_in(wanted, **_):
+        for trial in wanted:
+            given = parse(unlearn.Options, "unlearn", trial.flags)
+            asked_for.append((given.base, given.seed))
+            shutil.copytree(next((swept[0] / "trials").glob("*-s1-*/")), trial.folder)
+        return {}
+
+    monkeypatch.setattr(trials, "run_trials", stand_in)
+    first, second = base_run.checkpoint(4), base_run.checkpoint(2)
+    finished(sweep.main, options(sweep.Options, base_run, tmp_path, kind="seeds", bases=f"{first}, {second}"))
+    assert asked_for == [(first, 0), (second, 0), (first, 1), (second, 1)]  # every base before a further seed
+    document = json.loads((tmp_path / "out" / "seeds.json").read_text())
+    assert [base["environment_steps"] for base in document["conditions"]["bases"]] == [128, 64]
+    variant = document["results"]["variants"]["λ = 16"]
+    assert list(variant["runs"]) == [FIRST, "base 1, seed 0", SECOND, "base 1, seed 1"]
+    assert estimates(variant)["policy"]["kept"]["episode_length"]["n"] == 2
+    page = (tmp_path / "out" / "seeds.md").read_text()
+    assert page.startswith("# The default run (2 bases × 2 seeds)\n")
+    assert "bases trained for 128 and 64 environment steps; targets: turn." in page
+    assert "interval over the n bases (Student's t)" in page
+
+
+def test_bases_that_cannot_stand_beside_each_other_are_refused(base_run, tmp_path, refused):
+    other = Path(shutil.copytree(base_run.checkpoint(4), tmp_path / "other"))
+    config = (other / "config.yaml").read_text()
+    (other / "config.yaml").write_text(config.replace("mode: residual", "mode: offset"))
+    bases = f"{base_run.checkpoint(4)},{other}"
+    message = refused(sweep.main, options(sweep.Options, base_run, tmp_path, kind="seeds", bases=bases))
+    assert message == (f"{other}: action.mode: found offset; accepted: residual, as in {base_run.checkpoint(4)}")
+
+
 @pytest.mark.parametrize("name", STUDIES)
 def test_every_study_comes_to_its_page_and_figure(name, base_run, watched_run, tmp_path, monkeypatch):
     asked_for = []
@@ -359,15 +402,81 @@ def test_every_study_comes_to_its_page_and_figure(name, base_run, watched_run, t
     module = importlib.import_module(f"experiments.{name}")
     other_clips = name in ("motion_types", "number_of_targets")
     subject = targets_study(("turn", "nod"), name, module.STUDY.title) if other_clips else module.STUDY
-    given = options(lab.Options, base_run, tmp_path)
+    given = options(StudyOptions, base_run, tmp_path)
     run = finished(lambda given: conduct.conduct(subject, given, "make experiments"), given)
     out = tmp_path / "out"
     assert sorted(path.suffix for path in out.glob(f"{name}.*")) == [".json", ".md", ".png"]
     assert asked_for
     page = (out / f"{name}.md").read_text()
-    assert page.startswith(f"# {subject.title}\n")
+    assert page.startswith(f"# {subject.title} (1 base × 2 seeds)\n")
     assert "nan" not in page
     assert run.printed
+
+
+def test_overlap_forgets_the_half_of_a_clip_from_a_base_that_knew_the_whole(base_run, tmp_path, monkeypatch):
+    monkeypatch.setattr(executor, "on_this_machine", in_process)
+    study = importlib.import_module("experiments.overlap").overlap_study(
+        {"sway_first_half": "sway_second_half"}, "sway"
+    )
+    given = options(StudyOptions, base_run, tmp_path, seeds=1, jobs=1)
+    finished(lambda given: conduct.conduct(study, given, "make experiments"), given)
+    document = json.loads((tmp_path / "out" / "overlap.json").read_text())
+    (trial,) = (tmp_path / "trials").glob("arft-sway_first_half-*/")
+    assert document["results"]["variants"]["sway_first_half"]["options"] == {"targets": "sway_first_half"}
+    assert document["results"]["distances"]["sway_first_half"].keys() == {"sway_second_half", "turn", "nod"}
+    (base,) = (tmp_path / "trials").glob("halves-of-sway-*/base-*")
+    tensors = [load_file(folder / "policy.safetensors") for folder in (base, base_run.checkpoint(4))]
+    assert all(np.array_equal(tensors[0][name], tensors[1][name]) for name in tensors[0] if name != "failure_level")
+    assert load_config(trial / "config.yaml").base == str(base)
+    page = (tmp_path / "out" / "overlap.md").read_text()
+    assert "\nOurs, not in the paper: What lies near a target loses more than what lies far from it.\n" in page
+    assert "\n| sway_first_half | **sway_second_half** | 0." in page
+
+
+@pytest.fixture
+def control(base_run, tmp_path) -> Path:
+    """The base as if it had been pretrained without `turn`."""
+    folder = Path(shutil.copytree(base_run.checkpoint(4), tmp_path / "control"))
+    config = load_config(folder / "config.yaml")
+    save_config(unlearning_config(config, UnlearnConfig(("turn",), "retrain")), folder / "config.yaml")
+    return folder
+
+
+def test_a_control_stands_for_the_retrained_policy_and_is_evaluated_beside_its_base(base_run, control, tmp_path):
+    of = Lab(options(StudyOptions, base_run, tmp_path, controls=str(control)), iterations=2)
+    policy = policy_hash(read_info(control))
+    assert of.control_conditions() == {"controls": [policy]}
+    assert of.retrained == {Repeat(0, 0): {"control": True}}
+    trial = of.trial({"control": True}, Repeat(0, 0))
+    assert (trial.command, trial.task.iterations) == ("evaluate", 0)
+    given = parse(evaluate.Options, "evaluate", [*trial.flags, "--output", str(trial.folder)])
+    finished(evaluate.main, given)
+    assert trial.finished
+    assert newest_policy(trial.folder) == control
+    document = json.loads((trial.folder / "evaluation.json").read_text())
+    assert (document["targets"], document["episodes"], document["seed"]) == (["turn"], 2, 0)
+    assert document["policy_hashes"] == {"base": policy, "retrained": policy}
+    found = summary(trial.folder)
+    assert found["policy"]["clips"] == found["base"]["clips"]  # of one policy on the same episodes
+    assert found.keys() == {"policy", "base", "zero_action"}
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"controls": "BASE"}, "unlearn.method: found none; accepted for a control: distill or retrain"),
+        ({"targets": "nod"}, "unlearn.targets: found ['turn']; accepted for a control: ['nod']"),
+        ({"controls": "CONTROL,CONTROL/"}, "--controls: found 2; accepted: one for each base at most, here 1"),
+    ],
+)
+def test_what_is_no_control_is_refused(base_run, control, tmp_path, given, message):
+    given = {"controls": "CONTROL"} | given
+    places = {"CONTROL": str(control), "BASE": str(base_run.checkpoint(4))}
+    for name, place in places.items():
+        given["controls"] = given["controls"].replace(name, place)
+    with pytest.raises(InputError) as refused:
+        Lab(options(StudyOptions, base_run, tmp_path, **given), iterations=2)
+    assert str(refused.value).endswith(message)
 
 
 def test_the_comparison_asks_for_every_method_and_every_sampler_with_and_without_the_wrench(
@@ -385,7 +494,7 @@ def test_the_comparison_asks_for_every_method_and_every_sampler_with_and_without
 
     monkeypatch.setattr(trials, "run_trials", stand_in)
     module = importlib.import_module("experiments.comparison")
-    given = options(lab.Options, base_run, tmp_path, control_iterations=7)
+    given = options(StudyOptions, base_run, tmp_path, control_iterations=7)
     finished(lambda given: conduct.conduct(module.STUDY, given, ""), given)
     from forgetmimic_jax.unlearning.registry import methods
 

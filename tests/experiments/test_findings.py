@@ -4,38 +4,50 @@ import math
 
 import pytest
 
-from experiments import comparison, heat_map, membership, physical_behaviour, relearning, training_dynamics, validity
+from experiments import (
+    comparison,
+    heat_map,
+    membership,
+    overlap,
+    physical_behaviour,
+    relearning,
+    training_dynamics,
+    validity,
+)
 from forgetmimic_jax.evaluation.relearning import Lasted
+from forgetmimic_jax.evaluation.repeats import Repeat
 from forgetmimic_jax.evaluation.statistics import over_seeds
 from forgetmimic_jax.evaluation.verdict import sooner_than_control
 from forgetmimic_jax.studies import penalty, samplers, targets
 from forgetmimic_jax.studies.findings import mean_gained
 from forgetmimic_jax.studies.variants import DEVIATION
 
+REPEATS = [str(Repeat(0, seed)) for seed in range(3)]
+
 
 def variant(target: list[float], kept: list[float], base: float = 0.6, skill: list[float] | None = None) -> dict:
-    """As a study's JSON has it, a seed each."""
+    """As a study's JSON has it, a seed each of one base."""
 
     def group(value: float) -> dict:
         return {"success_rate": value, "survival_weighted_tracking": value, "episodes": 40}
 
-    seeds = {
-        str(seed): {
+    runs = {
+        str(Repeat(0, seed)): {
             "policy": {"target": group(a), "kept": group(b)},
             "base": {"target": group(0.8), "kept": group(base)},
         }
         for seed, (a, b) in enumerate(zip(target, kept, strict=True))
     }
-    for run, value in zip(seeds.values(), skill or [], strict=False):
+    for run, value in zip(runs.values(), skill or [], strict=False):
         run["policy"]["target"]["skill"] = value
-    return {"options": {}, "seeds": seeds}
+    return {"options": {}, "runs": runs}
 
 
 def words(findings) -> dict[str, str]:
     return {found.claim: found.word for found in findings}
 
 
-def test_differences_are_between_runs_of_the_same_seed():
+def test_differences_are_between_runs_of_the_same_repeat():
     found = {"a": variant([0.0, 0.1], [0.5, 0.7]), "b": variant([0.1], [0.45])}
     assert mean_gained(found, "a", None, "kept", "success_rate")["mean"] == pytest.approx(0.0)
     only = mean_gained(found, "a", "b", "kept", "success_rate")
@@ -50,7 +62,7 @@ def test_the_default_run_is_compared_with_its_control_the_ratio_and_zero_actions
         label: variant([0.0, 0.0, 0.0], [0.6, 0.6, 0.6], skill=[-0.1, -0.12, -0.11]),
         control: variant([0.8, 0.8, 0.8], [0.67, 0.68, 0.69]),
     }
-    runs = found[label]["seeds"].values()
+    runs = found[label]["runs"].values()
     for steps, ratio, run in zip((9.0, 9.5, 10.0), (0.05, 0.06, 0.07), runs, strict=True):
         run["policy"]["survival_weighted_degradation_ratio"] = ratio
         run["policy"]["target"] |= {"episode_length": steps, DEVIATION: 0.01 * steps}
@@ -123,9 +135,9 @@ def test_the_comparison_by_hand():
 
 def test_a_policy_that_falls_sooner_than_with_zero_actions_does_not_only_lack_a_skill():
     policies = {
-        "base": {"0": {"episode_length": [60.0, 64.0]}},
-        "zero action": {"0": {"episode_length": [16.0, 18.0]}},
-        "λ = 16": {str(seed): {"episode_length": [5.0, 6.0 + seed]} for seed in range(3)},
+        "base": {"base 0, seed 0": {"episode_length": [60.0, 64.0]}},
+        "zero action": {"base 0, seed 0": {"episode_length": [16.0, 18.0]}},
+        "λ = 16": {str(Repeat(0, seed)): {"episode_length": [5.0, 6.0 + seed]} for seed in range(3)},
     }
     document = {"results": {"policies": policies}}
     assert [of.word for of in physical_behaviour.findings(document)] == ["does not hold"]
@@ -133,13 +145,13 @@ def test_a_policy_that_falls_sooner_than_with_zero_actions_does_not_only_lack_a_
     assert physical_behaviour.answer(document) == (
         "An episode of a target lasts 6.0 [4.8, 7.2] steps; with the base 62.0, with zero actions 17.0."
     )
-    for seed, run in policies["λ = 16"].items():
-        run["episode_length"] = [17.0, 17.0 + int(seed)]
+    for seed, run in enumerate(policies["λ = 16"].values()):
+        run["episode_length"] = [17.0, 17.0 + seed]
     measured = ("foot_contact", "joint_limit_violation", DEVIATION)
     for label, values in (("base", (0.6, 0.1, 0.1)), ("zero action", (0.8, 0.2, 0.12))):
-        policies[label]["0"] |= {name: [value] for name, value in zip(measured, values, strict=True)}
-    for seed, run in policies["λ = 16"].items():
-        run |= {name: [value + 0.01 * int(seed)] for name, value in zip(measured, (0.4, 0.09, 0.2), strict=True)}
+        policies[label]["base 0, seed 0"] |= {name: [value] for name, value in zip(measured, values, strict=True)}
+    for seed, run in enumerate(policies["λ = 16"].values()):
+        run |= {name: [value + 0.01 * seed] for name, value in zip(measured, (0.4, 0.09, 0.2), strict=True)}
     found = list(physical_behaviour.findings(document))
     assert [(of.word, of.main) for of in found] == [
         *(("holds", True), ("does not hold", True), ("holds", False), ("open", False))
@@ -166,8 +178,8 @@ def test_the_training_curves_are_compared_with_what_the_paper_reads_off_them():
     assert found({b: rows(anti, gone)}) == ["holds", "holds"]
     assert found({b: rows(anti, {**gone, "target/R_anti": [-8.0, -8.1, -8.2]})}) == ["holds", "does not hold"]
     assert found({b: rows({n: v[:1] for n, v in anti.items()}, {n: v[:1] for n, v in gone.items()})}) == [
-        "one seed: yes",
-        "one seed: yes",
+        "one run: yes",
+        "one run: yes",
     ]
 
 
@@ -186,8 +198,8 @@ def swept(skills: dict[float, list[float]]) -> dict:
     return {
         str(penalty): {
             "options": {"penalty": str(penalty)},
-            "seeds": {
-                str(seed): {"policy": {"target": {"skill": skill}}, "lambda_crit": 7.6 + 0.1 * seed}
+            "runs": {
+                str(Repeat(0, seed)): {"policy": {"target": {"skill": skill}}, "lambda_crit": 7.6 + 0.1 * seed}
                 for seed, skill in enumerate(of)
             },
         }
@@ -203,20 +215,20 @@ def swept(skills: dict[float, list[float]]) -> dict:
         # 8 x 2^(0.4 / 0.8)
         ({8.0: [0.9, 0.9, 0.9], 16.0: [0.1, 0.1, 0.1]}, "does not hold", "11.3 [11.3, 11.3]"),
         # the second seed's half is gone below 4: 5.7, at most 4 and 5.7 are below 8 in the mean, [2.7, 7.5]
-        ({4.0: [0.9, 0.3, 0.9], 8.0: [0.1, 0.05, 0.1]}, "holds", "5.7, below 4, 5.7 (seed by seed)"),
-        ({4.0: [0.3, 0.3, 0.3], 8.0: [0.1, 0.1, 0.1]}, "holds", "below 4, below 4, below 4 (seed by seed)"),
+        ({4.0: [0.9, 0.3, 0.9], 8.0: [0.1, 0.05, 0.1]}, "holds", "5.7, below 4, 5.7 (run by run)"),
+        ({4.0: [0.3, 0.3, 0.3], 8.0: [0.1, 0.1, 0.1]}, "holds", "below 4, below 4, below 4 (run by run)"),
         # one seed needs more than was tried
-        ({4.0: [0.9, 0.9, 0.9], 8.0: [0.1, 0.1, 0.9]}, "open", "5.7, 5.7, above 8 (seed by seed)"),
-        ({4.0: [0.9, 0.9, 0.9], 16.0: [0.9, 0.9, 0.9]}, "does not hold", "above 16, above 16, above 16 (seed by seed)"),
+        ({4.0: [0.9, 0.9, 0.9], 8.0: [0.1, 0.1, 0.9]}, "open", "5.7, 5.7, above 8 (run by run)"),
+        ({4.0: [0.9, 0.9, 0.9], 16.0: [0.9, 0.9, 0.9]}, "does not hold", "above 16, above 16, above 16 (run by run)"),
         # below the smallest says nothing of a bound that is smaller still
-        ({12.0: [0.3, 0.3, 0.3], 16.0: [0.1, 0.1, 0.1]}, "open", "below 12, below 12, below 12 (seed by seed)"),
-        ({4.0: [0.3, 0.9, 0.9], 16.0: [0.1, 0.9, 0.9]}, "open", "below 4, above 16, above 16 (seed by seed)"),
-        ({4.0: [0.3]}, "one seed: yes", "below 4 (seed by seed)"),
-        ({16.0: [0.9]}, "one seed: no", "above 16 (seed by seed)"),
-        ({16.0: [0.3]}, "open", "below 16 (seed by seed)"),
+        ({12.0: [0.3, 0.3, 0.3], 16.0: [0.1, 0.1, 0.1]}, "open", "below 12, below 12, below 12 (run by run)"),
+        ({4.0: [0.3, 0.9, 0.9], 16.0: [0.1, 0.9, 0.9]}, "open", "below 4, above 16, above 16 (run by run)"),
+        ({4.0: [0.3]}, "one run: yes", "below 4 (run by run)"),
+        ({16.0: [0.9]}, "one run: no", "above 16 (run by run)"),
+        ({16.0: [0.3]}, "open", "below 16 (run by run)"),
     ],
 )
-def test_half_of_the_skill_gone_below_w_is_asked_of_every_seed(skills, word, evidence):
+def test_half_of_the_skill_gone_below_w_is_asked_of_every_run(skills, word, evidence):
     document = {"results": {"variants": swept(skills)}}
     (found,) = penalty.findings(document)
     assert found.word == word
@@ -266,7 +278,7 @@ def test_any_motion_is_forgotten_and_the_others_stay():
         ([0.1, 0.12, 0.11], [0.0, 0.0, 0.0], ["does not hold", "holds"]),  # marked by having been forgotten
         ([0.4, 0.5, 0.6], [0.0, 0.1, 0.05], ["open", "open"]),
         ([0.4, 0.5, 0.6], [0.2, 0.21, 0.22], ["open", "does not hold"]),
-        ([0.9], [0.9], ["open", "one seed: no"]),
+        ([0.9], [0.9], ["open", "one run: no"]),
     ],
 )
 def test_membership_shows_in_the_auc_on_either_side_and_in_the_hits(auc, hits, expected):
@@ -286,10 +298,10 @@ def curve(at: int, first: float = 0.1) -> dict:
 
 def relearned(unlearned: list[int], distilled: list[int]) -> list:
     starts = {
-        label: {str(seed): curve(at) for seed, at in enumerate(of)}
+        label: {str(Repeat(0, seed)): curve(at) for seed, at in enumerate(of)}
         for label, of in (("unlearned", unlearned), ("distilled", distilled))
     }
-    return list(relearning.findings({"results": {"base": dict.fromkeys("012", 0.9), "starts": starts}}))
+    return list(relearning.findings({"results": {"base": dict.fromkeys(REPEATS, 0.9), "starts": starts}}))
 
 
 @pytest.mark.parametrize(
@@ -302,9 +314,9 @@ def relearned(unlearned: list[int], distilled: list[int]) -> list:
         ([1, 9, 1], [4, 4, 4], "open"),
         ([9, 9, 9], [1, 2, 1], "holds"),  # never, where the control gets there
         ([9, 9, 9], [9, 9, 9], "open"),
-        ([4], [1], "one seed: yes"),
-        ([4], [9], "one seed: no"),
-        ([9], [4], "one seed: yes"),
+        ([4], [1], "one run: yes"),
+        ([4], [9], "one run: no"),
+        ([9], [4], "one run: yes"),
         ([9], [9], "open"),
     ],
 )
@@ -313,6 +325,35 @@ def test_what_comes_back_sooner_than_it_is_learned_was_not_forgotten(unlearned, 
     assert len(found) == len(relearning.SHARES)
     assert {one.word for one in found} == {word}
     assert [one.main for one in found] == [False, True, False]
+
+
+def overlap_document(retained: dict[str, list[float]], distances: dict[str, float]) -> dict:
+    """One target, `kick`; the kept clips' retention by repeat, of clips that the base tracks at 0.5."""
+    runs = {
+        repeat: {
+            "policy": {"clips": {clip: 0.5 * of[place] for clip, of in retained.items()}, "target": {"skill": 0.1}},
+            "base": {"clips": {**dict.fromkeys(retained, 0.5), "lost": 0.04}},
+        }
+        for place, repeat in enumerate(REPEATS)
+    }
+    results = {"variants": {"kick": {"options": {}, "runs": runs}}, "distances": {"kick": distances}}
+    return {"conditions": {"neighbours": {"kick": "spinkick"}}, "results": results}
+
+
+def test_what_is_near_a_target_loses_more_by_rank_and_against_the_others():
+    far = {"spinkick": 0.1, "punch": 0.2, "run": 0.3, "walk": 0.4, "lost": 0.05}
+    retained = {"spinkick": [0.5, 0.6, 0.7], "punch": [0.9, 0.8, 0.9], "run": [0.8, 0.9, 1.0], "walk": [1.0, 1.0, 1.1]}
+    document = overlap_document(retained, far)
+    # Ranks 1 3 2 4, 1 2 3 4 and 1 2 3 4 of retention: 1 - 6 * 2 / (4 * 15) = 0.8, then 1 and 1.
+    assert overlap.correlations(document["results"]) == pytest.approx(dict(zip(REPEATS, (0.8, 1.0, 1.0), strict=True)))
+    rises, less, gone = overlap.findings(document)
+    assert (rises.word, rises.main, less.word, less.main, gone.main) == ("holds", True, "holds", False, False)
+    # 0.5 - 0.9, 0.6 - 0.9 and 0.7 - 1.0
+    assert less.evidence == "retention of spinkick minus the other kept clips' mean -33 % [-48, -19]; bound 0 %"
+    assert overlap.answer(document).endswith("of the others: -33 % [-48, -19] (spinkick, with kick forgotten).")
+    near_kept = {"spinkick": [1.0] * 3, "punch": [0.9, 0.8, 0.9], "run": [0.7] * 3, "walk": [0.6] * 3}
+    turned = overlap_document(near_kept, far)
+    assert [of.word for of in overlap.findings(turned)][:2] == ["does not hold", "does not hold"]
 
 
 def test_the_evidence_of_relearning_names_the_steps_and_who_never_got_there():
@@ -330,23 +371,23 @@ def test_the_study_says_nothing_against_the_verdicts_rule(unlearned, control):
 
     sooner = sooner_than_control(lasted(unlearned), lasted(control))  # by half, for the verdict
     word = relearned([unlearned], [control])[1].word
-    assert (sooner, word) not in {(True, "one seed: yes"), (False, "open")}
-    if word == "one seed: yes":
+    assert (sooner, word) not in {(True, "one run: yes"), (False, "open")}
+    if word == "one run: yes":
         assert sooner is False
     if sooner:
-        assert word == "one seed: no"
+        assert word == "one run: no"
 
 
 def test_relearning_is_compared_with_every_control_and_says_which_one_starts_near_the_level():
     def seeds(at: int, first: float) -> dict:
-        return {str(seed): curve(at, first) for seed in range(3)}
+        return {repeat: curve(at, first) for repeat in REPEATS}
 
     starts = {"unlearned": seeds(2, 0.1), "distilled": seeds(3, 0.4), "fresh": seeds(4, 0.09)}
-    found = list(relearning.findings({"results": {"base": dict.fromkeys("012", 0.9), "starts": starts}}))
+    found = list(relearning.findings({"results": {"base": dict.fromkeys(REPEATS, 0.9), "starts": starts}}))
     assert [of.word for of in found] == ["the control starts near it", *["does not hold"] * 5]
     assert (found[0].p, found[0].main) == (None, False)
     assert found[0].evidence.endswith(", and starts at 44 %")
     assert "than a fresh policy needs" in found[3].claim
-    del starts["fresh"]["0"]["iterations"][0]
-    first = relearning.at_first({"base": dict.fromkeys("012", 0.9), "starts": starts}, "fresh")
-    assert first == {"1": pytest.approx(0.1), "2": pytest.approx(0.1)}
+    del starts["fresh"][REPEATS[0]]["iterations"][0]
+    first = relearning.at_first({"base": dict.fromkeys(REPEATS, 0.9), "starts": starts}, "fresh")
+    assert first == {repeat: pytest.approx(0.1) for repeat in REPEATS[1:]}

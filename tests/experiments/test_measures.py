@@ -1,5 +1,6 @@
 """What each study runs and measures, with policies that a stand-in tells apart by their paths: no run, no rollout."""
 
+import dataclasses
 import itertools
 import json
 from pathlib import Path
@@ -8,30 +9,35 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from experiments import heat_map, membership, physical_behaviour, relearning, training_dynamics
+from experiments import heat_map, membership, overlap, physical_behaviour, relearning, training_dynamics
 from forgetmimic_jax import unlearn
+from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.evaluation.metrics import Rollout
+from forgetmimic_jax.evaluation.repeats import Repeat
+from forgetmimic_jax.motion.library import read_library
 from forgetmimic_jax.settings.config import Config
-from forgetmimic_jax.studies.lab import Lab, Options
+from forgetmimic_jax.studies.lab import Lab
+from forgetmimic_jax.studies.options import Options
 from forgetmimic_jax.training.unlearning_run import config_of
 
 TARGET, KEPT = "punch", "run"
+FIRST, SECOND = "base 0, seed 0", "base 0, seed 1"
 TRACKING = "survival_weighted_tracking"
 
 
 class StandIn(Lab):
-    """A lab of two seeds, one target and one kept clip, whose runs are folders named LABEL-SEED."""
+    """A lab of one base and two seeds, one target and one kept clip, whose runs are folders named LABEL-SEED."""
 
     def __init__(self, root: Path, iterations: int = 4):
         self.options, self.iterations = Options(episodes=4), iterations
-        self.base, self.targets, self.seeds = root / "base", (TARGET,), (0, 1)
+        self.targets, self.repeats, self.controls = (TARGET,), (Repeat(0, 0), Repeat(0, 1)), ()
         self.config = Config()
-        self.info = SimpleNamespace(clips=(KEPT, TARGET), environment_steps=7 * 4096 * 24)
+        self.bases = (SimpleNamespace(path=root / "base", clips=(KEPT, TARGET), environment_steps=7 * 4096 * 24),)
         self.root, self.wanted = root, []
 
     def run(self, variants, what):
         self.wanted.append(dict(variants))
-        folders = {(label, seed): self.root / f"{label}-{seed}" for label, seed in variants}
+        folders = {(label, of): self.root / f"{label}-{of.seed}" for label, of in variants}
         for folder in folders.values():
             (folder / "checkpoints" / "00000004").mkdir(parents=True, exist_ok=True)
             (folder / "checkpoints" / "00000004" / "meta.json").touch()
@@ -102,10 +108,10 @@ def test_membership_learns_from_the_kept_clips_and_is_asked_about_the_targets(tm
         assert found[label]["tpr_at_5_percent_fpr"]["mean"] == pytest.approx(tpr), label
         assert found[label]["auc"]["n"] == policies
     (wanted,) = lab.wanted
-    assert wanted["λ = 16", 1] == {"seed": 1}
-    assert wanted["fine-tuned, all clips", 0] == {"method": "finetune", "clips": "all", "seed": 0}
-    assert wanted["distilled", 1] == {"method": "distill", "seed": 1}
-    assert wanted["retrained", 0] == {"method": "retrain", "iterations": 7, "seed": 0}
+    assert wanted["λ = 16", Repeat(0, 1)] == {}
+    assert wanted["fine-tuned, all clips", Repeat(0, 0)] == {"method": "finetune", "clips": "all"}
+    assert wanted["distilled", Repeat(0, 1)] == {"method": "distill"}
+    assert wanted["retrained", Repeat(0, 0)] == {"method": "retrain", "iterations": 7}
 
 
 AT_START = {
@@ -129,9 +135,10 @@ class Relearned(StandIn):
 
     def run(self, variants, what):
         folders = super().run(variants, what)
-        for (label, seed), variant in variants.items():
+        for (label, repeat), variant in variants.items():
             if what != "relearning":
                 continue
+            seed = repeat.seed
             folder = self.root / "relearned" / f"{label}-{seed}"
             start = AT_START[name_of(variant["base"])] if "base" in variant else 0.0
             clips = [{TARGET: {TRACKING: start + 0.05 * i}, KEPT: {TRACKING: 0.99}} for i in (1, 2)]
@@ -141,7 +148,7 @@ class Relearned(StandIn):
             )
             log = [{"iteration": 10, "environment_steps": 1000, "target/step_share": 0.25 + 0.25 * seed}]
             write_rows(folder / "metrics.jsonl", log)
-            folders[label, seed] = folder
+            folders[label, repeat] = folder
         return folders
 
 
@@ -149,8 +156,8 @@ class Relearned(StandIn):
 def test_relearning_starts_from_each_policy_and_its_levels_are_the_bases(tmp_path):
     lab = Relearned(tmp_path)
     found = relearning.measure(lab)
-    assert found["base"] == pytest.approx({"0": 0.8, "1": 0.81})
-    curves = {(label, seed): of for label, runs in found["starts"].items() for seed, of in runs.items()}
+    assert found["base"] == pytest.approx({FIRST: 0.8, SECOND: 0.81})
+    curves = {(label, repeat[-1]): of for label, runs in found["starts"].items() for repeat, of in runs.items()}
     assert curves.keys() == {
         *(("unlearned", "0"), ("unlearned", "1"), ("distilled", "0"), ("distilled", "1")),
         *(("retrained", "0"), ("fresh", "0"), ("fresh", "1")),
@@ -169,18 +176,17 @@ def test_whatever_the_start_relearning_is_on_all_clips_half_on_targets_and_free_
     lab = Relearned(tmp_path)
     relearning.measure(lab)
     policies, relearned = lab.wanted
-    assert policies["unlearned", 1] == {"iterations": 200, "seed": 1}
-    assert policies["distilled", 0] == {"iterations": 200, "method": "distill", "seed": 0}
-    assert policies["retrained", 0] == {"method": "retrain", "iterations": 7, "seed": 0}
+    assert policies["unlearned", Repeat(0, 1)] == {"iterations": 200}
+    assert policies["distilled", Repeat(0, 0)] == {"iterations": 200, "method": "distill"}
+    assert policies["retrained", Repeat(0, 0)] == {"method": "retrain", "iterations": 7}
     assert len(relearned) == 7
     settings = set()
-    for (label, seed), variant in relearned.items():
+    for (label, _), variant in relearned.items():
         given = {name: value for name, value in variant.items() if name != "base"}
         config = config_of(unlearn.Options(**{**given, "set": [variant["set"]]}))
         assert (variant["method"], "base" in variant) == (
             ("retrain", False) if label == "fresh" else ("finetune", True)
         ), label
-        assert config.seed == seed
         assert config.sampling.clips == "all"
         assert config.ppo.base_kl == 0.0
         assert config.wrench.max_gain == 0.0
@@ -216,18 +222,19 @@ def test_physical_behaviour_is_measured_on_the_targets_over_the_steps_that_all_s
     measured = physical_behaviour.measure(Measured(tmp_path))
     found = measured["policies"]
     assert {label: list(runs) for label, runs in found.items()} == {
-        **{"base": ["0"], "zero action": ["0"], "fine-tuned": ["0", "1"], "λ = 8": ["0", "1"], "λ = 16": ["0", "1"]}
+        **{"base": [FIRST], "zero action": [FIRST]},
+        **{key: [FIRST, SECOND] for key in ("fine-tuned", "λ = 8", "λ = 16")},
     }
-    assert found["base"]["0"]["episode_length"] == [4.0, 4.0]
-    assert found["zero action"]["0"]["episode_length"] == [4.0, 3.0]
-    assert found["λ = 16"]["1"]["episode_length"] == [3.0, 2.0]
+    assert found["base"][FIRST]["episode_length"] == [4.0, 4.0]
+    assert found["zero action"][FIRST]["episode_length"] == [4.0, 3.0]
+    assert found["λ = 16"][SECOND]["episode_length"] == [3.0, 2.0]
     # the error grows by its value each step: its mean over n steps is (n + 1) / 2 times the value
-    assert found["λ = 8"]["1"]["foot_contact"] == pytest.approx([2.5 * 0.41, 2.5 * 0.41])
-    assert found["λ = 8"]["1"]["foot_contact_common"] == pytest.approx([2.0 * 0.41, 1.5 * 0.41])
-    assert found["λ = 16"]["0"]["foot_contact_common"] == pytest.approx([2.0 * 0.5, 1.5 * 0.5])
+    assert found["λ = 8"][SECOND]["foot_contact"] == pytest.approx([2.5 * 0.41, 2.5 * 0.41])
+    assert found["λ = 8"][SECOND]["foot_contact_common"] == pytest.approx([2.0 * 0.41, 1.5 * 0.41])
+    assert found["λ = 16"][FIRST]["foot_contact_common"] == pytest.approx([2.0 * 0.5, 1.5 * 0.5])
     unbounded = measured["unbounded"]
-    assert unbounded["λ = 8"]["1"]["upright_rate"] == [1.0, None]
-    assert unbounded["λ = 8"]["1"]["impact_force"] == pytest.approx([0.0, 4.1])
+    assert unbounded["λ = 8"][SECOND]["upright_rate"] == [1.0, None]
+    assert unbounded["λ = 8"][SECOND]["impact_force"] == pytest.approx([0.0, 4.1])
 
 
 def test_numbers_without_terminations_are_over_the_runs_and_the_episodes_that_define_them():
@@ -236,10 +243,10 @@ def test_numbers_without_terminations_are_over_the_runs_and_the_episodes_that_de
         return numbers | {"upright_rate": upright, "impact_force": impact, "impact_speed": speed}
 
     policies = {
-        "base": {"0": run([1.0, 1.0], [0.0, 2.0], [None, None])},
+        "base": {FIRST: run([1.0, 1.0], [0.0, 2.0], [None, None])},
         "λ = 16": {
-            "0": run([0.0, 1.0, None], [1.0, 2.0, 9.0], [2.0, None, 4.0]),
-            "1": run([0.0, 0.0], [3.0, 5.0], [None, None]),
+            FIRST: run([0.0, 1.0, None], [1.0, 2.0, 9.0], [2.0, None, 4.0]),
+            SECOND: run([0.0, 0.0], [3.0, 5.0], [None, None]),
         },
     }
     table = physical_behaviour.unbounded_table(policies)
@@ -261,7 +268,7 @@ def test_the_heat_map_has_the_base_first_and_then_every_evaluation_of_each_seed(
 
     class Watched(StandIn):
         def as_watched(self, policies, seed):
-            assert policies == {"base": self.base}
+            assert policies == {"base": self.bases[0].path}
             return {"base": clips(0.8 + 0.1 * seed, 0.7)}
 
     lab = Watched(tmp_path, iterations=42)
@@ -273,9 +280,46 @@ def test_the_heat_map_has_the_base_first_and_then_every_evaluation_of_each_seed(
     assert [at[TARGET][TRACKING]["mean"] for at in found["checkpoints"]] == pytest.approx([0.85, 0.4, 0.4])
     assert [at["target"][TRACKING]["mean"] for at in found["groups"]] == pytest.approx([0.85, 0.4, 0.4])
     assert [at["kept"]["tracking_reward"]["mean"] for at in found["groups"]] == pytest.approx([0.8, 0.7, 0.7])
-    assert lab.wanted == [
-        {("λ = 16", s): {"seed": s, "set": ["evaluate_every=2", "evaluate_episodes=2"]} for s in (0, 1)}
-    ]
+    assert lab.wanted == [{("λ = 16", of): {"set": ["evaluate_every=2", "evaluate_episodes=2"]} for of in lab.repeats}]
+
+
+def test_overlap_forgets_half_a_clip_and_keeps_the_other_on_a_library_of_its_own(tmp_path, library_folder, robot):
+    config = dataclasses.replace(Config(), library=str(library_folder))
+
+    class Halved(StandIn):
+        def over_repeats(self, variants, what, *, others):
+            self.wanted.append(others)
+            return {"variants": {}}
+
+    lab = Halved(tmp_path)
+    lab.options = Options(trials=tmp_path / "trials")
+    lab.config, lab.bases = config, (SimpleNamespace(path=tmp_path / "base", library_hash="abcd"),)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(overlap, "write_base", lambda base, library, folder: folder / "base")
+        neighbours = {"nod": "turn", "sway_first_half": "sway_second_half"}
+        found = overlap.measure(lab, neighbours, "sway")
+        assert overlap.measure(lab, neighbours, "sway") == found  # from the library that is there now
+        with pytest.raises(InputError, match=r"no clip 'swing' in its library; known: sway_first_half, "):
+            overlap.measure(lab, {"swing": "turn"}, "sway")
+    folder = tmp_path / "trials" / "halves-of-sway-abcd"
+    wanted = lab.wanted[0]["sway_first_half"]
+    library = folder / "clips"
+    given = {"targets": "sway_first_half", "library": library, "base": folder / "base"}
+    assert wanted == {repeat: given for repeat in lab.repeats}
+    whole, *halves = (
+        clip.joint_pos
+        for path, names in ((library_folder, ["sway"]), (library, ["sway_first_half", "sway_second_half"]))
+        for clip in read_library(robot, path, names)
+    )
+    assert np.array_equal(np.concatenate(halves), whole)
+    assert {clip.name for clip in read_library(robot, library)} == {"nod", "turn", *neighbours, "sway_second_half"}
+    assert found["distances"]["nod"].keys() == {"turn", "sway_first_half", "sway_second_half"}
+    clip = read_library(robot, library, ["turn"])[0]
+    still, *others = (
+        dataclasses.replace(clip, name=name, joint_pos=np.full_like(clip.joint_pos, at))
+        for name, at in (("still", 0.0), ("near", 0.1), ("far", 0.3))
+    )
+    assert overlap.distances_to("still", [still, *others]) == pytest.approx({"near": 0.1, "far": 0.3})
 
 
 def test_training_curves_are_over_the_rows_that_every_seed_has(tmp_path):
@@ -293,5 +337,5 @@ def test_training_curves_are_over_the_rows_that_every_seed_has(tmp_path):
     assert [row["entropy"]["mean"] for row in of["rows"]] == [1.5, 10.5, 20.5]
     assert [row.get("target/lambda_crit", {}).get("mean") for row in of["rows"]] == [9.0, None, 7.5]
     (wanted,) = lab.wanted
-    assert wanted[training_dynamics.A, 1] == {"penalty": 2.0, "sampler": "adaptive", "wrench": True, "seed": 1}
-    assert wanted[training_dynamics.B, 0] == {"penalty": 8.0, "seed": 0}
+    assert wanted[training_dynamics.A, Repeat(0, 1)] == {"penalty": 2.0, "sampler": "adaptive", "wrench": True}
+    assert wanted[training_dynamics.B, Repeat(0, 0)] == {"penalty": 8.0}

@@ -5,9 +5,17 @@ import math
 import pytest
 from scipy import stats
 
+from forgetmimic_jax.evaluation.repeats import Repeat
 from forgetmimic_jax.evaluation.statistics import over_seeds
 from forgetmimic_jax.studies import claim, variants
 from forgetmimic_jax.studies.claim import Between, Finding, answer, corrected, finding, finding_between, judged, p_value
+
+REPEATS = [str(Repeat(0, seed)) for seed in range(3)]
+
+
+def by_repeat(values: list[Between]) -> dict[str, Between]:
+    """Numbers of one base, a seed each."""
+    return dict(zip(REPEATS, values, strict=False))
 
 
 @pytest.mark.parametrize(
@@ -18,8 +26,8 @@ from forgetmimic_jax.studies.claim import Between, Finding, answer, corrected, f
         ([0.5, 0.52, 0.51], True, "does not hold"),
         ([0.0, 0.1, 0.05], True, "open"),
         ([0.0, 0.1, 0.05], False, "open"),
-        ([0.04], True, "one seed: yes"),
-        ([0.04], False, "one seed: no"),
+        ([0.04], True, "one run: yes"),
+        ([0.04], False, "one run: no"),
     ],
 )
 def test_a_claim_holds_where_the_whole_interval_does(values, below, word):
@@ -37,8 +45,8 @@ def test_a_p_value_is_that_of_students_test_and_crosses_five_per_cent_with_the_i
     assert p_value(over_seeds([0.3, 0.3]), 0.3) == 1.0
 
 
-def test_a_rate_that_is_the_same_with_every_seed_is_tested_by_all_its_episodes():
-    success = variants.over_seeds([{"success_rate": 0.05, "episodes": 40}] * 3)["success_rate"]
+def test_a_rate_that_is_the_same_in_every_run_is_tested_by_all_its_episodes():
+    success = variants.estimates_of({key: {"success_rate": 0.05, "episodes": 40} for key in REPEATS})["success_rate"]
     assert success["episodes"] == 120
     below = stats.binomtest(6, 120, 0.1, alternative="less").pvalue
     assert p_value(success, 0.1) == pytest.approx(2 * below)
@@ -63,7 +71,7 @@ def test_holms_correction_by_hand():
 
 def test_a_number_of_which_only_bounds_are_known_decides_what_they_allow():
     def word(values: list[Between], *, below: bool) -> str:
-        return finding_between("", values, 8.0, "", below=below).word
+        return finding_between("", by_repeat(values), 8.0, "", below=below).word
 
     known, under, over = Between(5.0, 5.0), Between(-math.inf, 6.0), Between(16.0, math.inf)
     assert word([known, under, known], below=True) == "holds"
@@ -72,17 +80,30 @@ def test_a_number_of_which_only_bounds_are_known_decides_what_they_allow():
     assert word([over, over, over], below=False) == "holds"
     assert word([known, known, over], below=True) == "open"
     assert word([under, over], below=True) == "open"
-    assert word([under], below=True) == "one seed: yes"
-    assert word([over], below=True) == "one seed: no"
+    assert word([under], below=True) == "one run: yes"
+    assert word([over], below=True) == "one run: no"
     assert word([Between(-math.inf, 12.0)], below=True) == "open"
+
+
+def test_with_several_bases_bounds_are_means_of_each_bases_seeds():
+    def between(*of_base: tuple[float, float]) -> dict[str, Between]:
+        """Two seeds of each base, of which the second is only known to lie above."""
+        pairs = {Repeat(base, 0): Between(of[0], of[0]) for base, of in enumerate(of_base)}
+        pairs |= {Repeat(base, 1): Between(of[1], math.inf) for base, of in enumerate(of_base)}
+        return {str(repeat): value for repeat, value in pairs.items()}
+
+    # Means of at least 9, 10 and 11 over three bases: Student's test of these three.
+    found = finding_between("", between((8.0, 10.0), (9.0, 11.0), (10.0, 12.0)), 5.0, "", below=False)
+    assert (found.word, found.n) == ("holds", 3)
+    assert found.p == pytest.approx(stats.ttest_1samp([9.0, 10.0, 11.0], 5.0).pvalue)
 
 
 def test_what_could_not_be_decided_counts_as_tested_only_where_it_was_measured():
     nothing, some = Between(-math.inf, math.inf), Between(-math.inf, 12.0)
-    assert finding_between("", [nothing, nothing], 8.0, "").p is None
-    assert finding_between("", [some, some], 8.0, "").p == 1.0
+    assert finding_between("", by_repeat([nothing, nothing]), 8.0, "").p is None
+    assert finding_between("", by_repeat([some, some]), 8.0, "").p == 1.0
     # 5, at most 6 and 5: Student's test of these three against 8
-    found = finding_between("", [Between(5.0, 5.0), Between(-math.inf, 6.0), Between(5.0, 5.0)], 8.0, "")
+    found = finding_between("", by_repeat([Between(5.0, 5.0), Between(-math.inf, 6.0), Between(5.0, 5.0)]), 8.0, "")
     assert found.p == pytest.approx(stats.ttest_1samp([5.0, 6.0, 5.0], 8.0).pvalue)
 
 
@@ -93,19 +114,19 @@ def test_what_could_not_be_decided_counts_as_tested_only_where_it_was_measured()
         (["holds", "open"], "open"),
         (["holds", "does not hold"], "does not hold"),
         (["open", "does not hold"], "does not hold"),
-        (["one seed: yes", "one seed: yes"], "one seed: yes"),
-        (["one seed: yes", "one seed: no"], "open"),
+        (["one run: yes", "one run: yes"], "one run: yes"),
+        (["one run: yes", "one run: no"], "open"),
     ],
 )
 def test_a_studys_answer_needs_all_of_its_main_findings(words, word):
     main = [Finding("part", word, f"number {i}", 3 - i, main=True) for i, word in enumerate(words)]
     other = Finding("more", "does not hold", "another number", 1)
     found = answer("the claim", [other, *main])
-    assert (found.claim, found.word, found.seeds) == ("the claim", word, 2)
+    assert (found.claim, found.word, found.n) == ("the claim", word, 2)
     assert found.evidence == "number 0; number 1"
 
 
 def test_the_table_has_the_main_findings_first():
     found = [finding("b", over_seeds([1.0, 1.1]), 9.0, "one"), finding("a", over_seeds([1.0]), 9.0, "two", main=True)]
     rows = claim.findings_table(found).splitlines()[2:]
-    assert rows == ["| a | **one seed: yes** | two | 1 |", "| b | **holds** | one | 2 |"]
+    assert rows == ["| a | **one run: yes** | two | 1 |", "| b | **holds** | one | 2 |"]

@@ -22,7 +22,7 @@ OTHER = {**HERE, "code": "0123abcd", "commit": "f" * 40}
 
 def document(groups: list[dict], variants: dict | None = None) -> dict:
     return {
-        "schema": 2,
+        "schema": 3,
         "study": "s",
         "conditions": {},
         "made_by": groups,
@@ -32,11 +32,11 @@ def document(groups: list[dict], variants: dict | None = None) -> dict:
 
 
 def test_a_document_comes_back_with_nine_digits_and_a_line_for_each_innermost_table(tmp_path):
-    content = document([], {"λ = 8": {"seeds": {"0": {"x": 1 / 3, "y": [2.0, 1e6 / 7.0]}}}})
+    content = document([], {"λ = 8": {"runs": {"0": {"x": 1 / 3, "y": [2.0, 1e6 / 7.0]}}}})
     path = tmp_path / "new" / "s.json"
     write_document(path, content)
     (found,) = read_document(path)["results"]["variants"].values()
-    assert found == {"seeds": {"0": {"x": 0.333333333, "y": [2.0, 142857.143]}}}
+    assert found == {"runs": {"0": {"x": 0.333333333, "y": [2.0, 142857.143]}}}
     assert json.loads(path.read_text()) == read_document(path)
     lines = [line.strip() for line in path.read_text().splitlines()]
     assert '"conditions": {},' in lines
@@ -48,7 +48,7 @@ def test_a_document_comes_back_with_nine_digits_and_a_line_for_each_innermost_ta
     ("text", "message"),
     [
         ("{", "damaged: "),
-        ('{"schema": 1, "study": "s"}', "schema: found 1; accepted: 2; remove it to measure again"),
+        ('{"schema": 1, "study": "s"}', "schema: found 1; accepted: 3; remove it to measure again"),
     ],
 )
 def test_a_document_of_another_kind_is_refused(tmp_path, text, message):
@@ -91,6 +91,6 @@ def test_what_is_no_study_says_nothing_of_trials(tmp_path):
     (tmp_path / "list.json").write_text("[1]")
     (tmp_path / "other.json").write_text('{"results": [1]}')
     (tmp_path / "old.json").write_text('{"schema": 1, "study": "old", "results": {}}')
-    variants = {"a": {"seeds": {"0": {"x": 1}}, "trials": {"0": "trial"}}}
-    write_document(tmp_path / "new.json", document([{**OTHER, "runs": ["a, seed 0"]}], variants))
+    variants = {"a": {"runs": {"base 0, seed 0": {"x": 1}}, "trials": {"base 0, seed 0": "trial"}}}
+    write_document(tmp_path / "new.json", document([{**OTHER, "runs": ["a, base 0, seed 0"]}], variants))
     assert known_trials(tmp_path) == {"trial": ("trial", {"x": 1}, OTHER)}

@@ -4,12 +4,18 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from forgetmimic_jax.studies.variants import gained, over_seeds, summary, variant_bars, variant_table
+from forgetmimic_jax.evaluation.repeats import Repeat
+from forgetmimic_jax.studies.variants import estimates_of, gained, summary, variant_bars, variant_table
+
+
+def by_repeat(runs: list) -> dict:
+    """Runs of one base, a seed each."""
+    return {str(Repeat(0, seed)): run for seed, run in enumerate(runs)}
 
 
 def test_numbers_of_several_seeds_become_students_intervals():
     values = [0.2, 0.5, 0.35]
-    found = over_seeds([{"target": {"success_rate": value}, "ratio": 2.0 * value} for value in values])
+    found = estimates_of(by_repeat([{"target": {"success_rate": value}, "ratio": 2.0 * value} for value in values]))
     low, high = stats.t.interval(0.95, 2, loc=np.mean(values), scale=stats.sem(values))
     estimate = found["target"]["success_rate"]
     assert (estimate["mean"], estimate["low"], estimate["high"]) == pytest.approx((np.mean(values), low, high))
@@ -18,20 +24,20 @@ def test_numbers_of_several_seeds_become_students_intervals():
 
 
 def test_one_seed_has_no_interval_and_a_number_that_some_lack_is_over_the_others():
-    found = over_seeds([{"skill": 0.5}, {}])
+    found = estimates_of(by_repeat([{"skill": 0.5}, {}]))
     assert found == {"skill": {"mean": 0.5, "n": 1}}
 
 
 def test_seeds_that_all_fail_have_the_exact_interval_of_their_episodes_together():
     runs = [{"success_rate": 0.0, "episodes": 40, "skill": 0.1}] * 3
-    found = over_seeds(runs)["success_rate"]
+    found = estimates_of(by_repeat(runs))["success_rate"]
     exact = stats.binomtest(0, 120).proportion_ci(method="exact")
     assert (found["low"], found["high"], found["n"]) == pytest.approx((0.0, exact.high, 3))
     assert found["episodes"] == 120
-    some = over_seeds([*runs[:2], {**runs[0], "success_rate": 0.3}])["success_rate"]
+    some = estimates_of(by_repeat([*runs[:2], {**runs[0], "success_rate": 0.3}]))["success_rate"]
     low, high = stats.t.interval(0.95, 2, loc=0.1, scale=stats.sem([0.0, 0.0, 0.3]))
     assert (some["low"], some["high"]) == pytest.approx((low, high))
-    assert "low" not in over_seeds(runs[:1])["success_rate"]
+    assert "low" not in estimates_of(by_repeat(runs[:1]))["success_rate"]
 
 
 def seeds(target: list[float], kept: list[float]) -> dict:
@@ -44,19 +50,19 @@ def seeds(target: list[float], kept: list[float]) -> dict:
     base = [{"target": group(success, 0.75), "kept": group(0.8, 0.7)} for success in (0.8, 1.0)]
     zero = [{"target": group(success, 0.1), "kept": group(0.0, 0.1)} for success in (0.0, 0.2)]
     runs = zip(policy, base, zero, strict=True)
-    return {str(i): {"policy": one, "base": b, "zero_action": z} for i, (one, b, z) in enumerate(runs)}
+    return by_repeat([{"policy": one, "base": b, "zero_action": z} for one, b, z in runs])
 
 
 @pytest.fixture
 def variants() -> dict:
-    return {"λ = 16": {"options": {}, "seeds": seeds([[0.0, 0.2], 0.2], [0.8, 0.7])}}
+    return {"λ = 16": {"options": {}, "runs": seeds([[0.0, 0.2], 0.2], [0.8, 0.7])}}
 
 
-def test_a_difference_is_between_runs_of_the_same_seed(variants):
-    assert gained(variants, "λ = 16", None, "target", "success_rate") == pytest.approx({"0": -0.8, "1": -0.8})
-    other = {"seeds": {"1": variants["λ = 16"]["seeds"]["0"]}}
+def test_a_difference_is_between_runs_of_the_same_repeat(variants):
+    assert gained(variants, "λ = 16", None, "target", "success_rate") == pytest.approx(by_repeat([-0.8, -0.8]))
+    other = {"runs": {"base 0, seed 1": variants["λ = 16"]["runs"]["base 0, seed 0"]}}
     of = {**variants, "other": other}
-    assert gained(of, "λ = 16", "other", "target", "success_rate") == pytest.approx({"1": 0.2})
+    assert gained(of, "λ = 16", "other", "target", "success_rate") == pytest.approx({"base 0, seed 1": 0.2})
     assert gained(of, "λ = 16", "gone", "target", "success_rate") == {}
 
 
@@ -97,8 +103,8 @@ def test_numbers_without_terminations_are_columns_which_are_empty_where_a_trial_
     header, _, *rows = [line.split(" | ") for line in variant_table(variants, {}).splitlines() if line.startswith("| ")]
     assert header[-3:] == ["upright", "impact", "content |"]
     assert rows[0][-3:] == ["", "", " |"]
-    for seed, run in variants["λ = 16"]["seeds"].items():
-        run["policy"]["target"] |= {"upright_rate": 0.0, "impact_rate": 0.9 + 0.1 * int(seed), "motion_content": -0.9}
+    for seed, run in enumerate(variants["λ = 16"]["runs"].values()):
+        run["policy"]["target"] |= {"upright_rate": 0.0, "impact_rate": 0.9 + 0.1 * seed, "motion_content": -0.9}
     rows = [line.split(" | ") for line in variant_table(variants, {}).splitlines() if line.startswith("| λ")]
     assert rows[0][-3:] == ["0 % [0, 0]", "95 % [31, 100]", "-0.90 [-0.90, -0.90] |"]
     assert len(rows[1]) == 9, "kept clips have none"

@@ -1,0 +1,88 @@
+"""The policies that a study starts from and compares with: its bases, and its retrained controls."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from forgetmimic_jax.basics.errors import InputError
+from forgetmimic_jax.settings.config import by_name
+from forgetmimic_jax.settings.options import comma_separated
+from forgetmimic_jax.studies.options import Options
+
+if TYPE_CHECKING:
+    from forgetmimic_jax.training.checkpoint import CheckpointInfo
+
+ALIKE = ("observation", "action")  # sections of the settings: a study rolls its policies out in one environment
+
+
+def find_bases(options: Options) -> tuple[CheckpointInfo, ...]:
+    """The bases that a study names, or the shipped ones.
+
+    Raises:
+        InputError: none, one of another robot, or one of other clips, observations or actions than the first.
+    """
+    from forgetmimic_jax.training.checkpoint import read_info
+    from forgetmimic_jax.training.start import base_folder, shipped_policies
+
+    if options.bases is None:
+        paths = shipped_policies(options.robot, "base") or (base_folder(options.robot),)
+    else:
+        paths = tuple(Path(name) for name in comma_separated(options.bases))
+    if not paths:
+        raise InputError("--bases: no checkpoint named; leave the flag out for the shipped ones")
+    infos = tuple(read_info(path) for path in paths)
+    if infos[0].robot != options.robot:
+        raise InputError(f"{infos[0].path}: robot: found '{infos[0].robot}'; --robot is '{options.robot}'")
+    for info in infos:
+        _check_alike(info, infos[0])
+    return infos
+
+
+def find_controls(
+    options: Options, targets: tuple[str, ...], bases: Sequence[CheckpointInfo]
+) -> tuple[CheckpointInfo, ...]:
+    """The retrained controls that a study names, or the shipped ones of its targets; one for each base at most.
+
+    Raises:
+        InputError: one that is named is of other clips, or rolled out a target.
+    """
+    from forgetmimic_jax.attacks.control import check_never_rolled_out
+    from forgetmimic_jax.training.checkpoint import read_info
+    from forgetmimic_jax.training.start import shipped_policies
+
+    if options.controls is None:
+        shipped = [read_info(path) for path in shipped_policies(options.robot, "control")]
+        alike = [info for info in shipped if info.library_hash == bases[0].library_hash]
+        return tuple(info for info in alike if set(info.config.unlearn.targets) == set(targets))[: len(bases)]
+    infos = tuple(read_info(Path(name)) for name in comma_separated(options.controls))
+    if len(infos) > len(bases):
+        raise InputError(f"--controls: found {len(infos)}; accepted: one for each base at most, here {len(bases)}")
+    for info in infos:
+        _check_alike(info, bases[0])
+        check_never_rolled_out(info, targets)
+    return infos
+
+
+def retrained_in_words(conditions: Mapping[str, Any]) -> str:
+    """How the retrained policies of a study were made, for its page."""
+    if "controls" in conditions:
+        return "The retrained policies are controls of `make pretrain WITHOUT=TARGETS`, trained as a base is."
+    return (
+        f"The retrained policy was trained for {conditions['control_iterations']:,} iterations; a short training makes "
+        "it a reference for the first steps only."
+    )
+
+
+def _check_alike(info: CheckpointInfo, first: CheckpointInfo) -> None:
+    """InputError where a policy cannot stand beside the first base."""
+    theirs, ours = by_name(info.config), by_name(first.config)
+    found: dict[str, Any] = {"robot": info.robot, "clips": info.clips, "library_hash": info.library_hash}
+    needed: dict[str, Any] = {"robot": first.robot, "clips": first.clips, "library_hash": first.library_hash}
+    for name in {**theirs, **ours}:
+        if name.startswith(tuple(f"{section}." for section in ALIKE)):
+            found[name], needed[name] = theirs.get(name), ours.get(name)
+    for name, value in found.items():
+        if value != needed[name]:
+            raise InputError(f"{info.path}: {name}: found {value}; accepted: {needed[name]}, as in {first.path}")
