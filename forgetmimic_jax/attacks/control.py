@@ -37,7 +37,7 @@ def read_control(run: Path, subject: CheckpointInfo, setup: Setup) -> Checkpoint
         InputError: no policy, or one that is no control of the unlearned one.
     """
     if not run.is_dir():
-        raise InputError(f"{run}: no such folder; name a run of METHOD=distill, retrain or pretrain, or leave it out")
+        raise InputError(f"{run}: no such folder; name a run of distill, retrain or pretrain, or leave it out")
     info = checkpoint.read_info(run)
     check_never_rolled_out(info, subject.config.unlearn.targets)
     if info.base not in (None, subject.base):

@@ -14,10 +14,14 @@ from toy import ToyStage
 from forgetmimic_jax import evidence, report
 from forgetmimic_jax.attacks import case as cases
 from forgetmimic_jax.attacks import fakes, judged
+from forgetmimic_jax.attacks.control import read_control
 from forgetmimic_jax.attacks.document import read_evidence
 from forgetmimic_jax.attacks.verdict import RULES, judge
-from forgetmimic_jax.settings.config import load_config
+from forgetmimic_jax.basics.errors import InputError
+from forgetmimic_jax.settings.config import UnlearnConfig, load_config, save_config
+from forgetmimic_jax.tracking.setup import make_setup
 from forgetmimic_jax.training.checkpoint import policy_hash, read_info
+from forgetmimic_jax.unlearning.registry import unlearning_config
 
 SMALL = {"control_iterations": 1, "recovery_iterations": 1, "relearning_iterations": 1, "episodes": 4}
 
@@ -123,7 +127,10 @@ def test_evidence_of_another_policy_is_refused(run, printed, tmp_path, refused):
     ("given", "message"),
     [
         ({"run": Path("nowhere")}, "nowhere: no run with a checkpoint"),
-        ({"control": Path("nowhere")}, "nowhere: no run with a checkpoint; name one of METHOD=distill or retrain, or "),
+        (
+            {"control": Path("nowhere")},
+            "nowhere: no such folder; name a run of distill, retrain or pretrain, or ",
+        ),
         ({"episodes": 1}, "--episodes: found 1; accepted: 2 or more"),
         ({"relearning_iterations": 0}, "--relearning-iterations: found 0; accepted: 1 or more"),
     ],
@@ -134,7 +141,21 @@ def test_bad_input_is_refused(run, refused, given, message):
 
 def test_a_run_that_unlearned_by_another_method_is_no_control(run, unlearned_run, refused):
     message = refused(evidence.main, evidence.Options(run=run, control=unlearned_run.folder))
-    assert message.startswith(f"{unlearned_run.folder}: unlearn.method: found arft, no control; accepted: ")
+    newest = unlearned_run.checkpoint(2)
+    assert message == f"{newest}: unlearn.method: found arft; accepted for a control: distill or retrain"
+
+
+def test_a_policy_that_was_pretrained_without_the_targets_is_a_control(unlearned_run, base_run, tmp_path):
+    folder = Path(shutil.copytree(base_run.checkpoint(4), tmp_path / "control"))
+    config = load_config(folder / "config.yaml")
+    save_config(unlearning_config(config, UnlearnConfig(("turn",), "retrain")), folder / "config.yaml")
+    info = read_info(unlearned_run.checkpoint(2))
+    found = read_control(folder, info, make_setup(info.config))
+    assert (found.path, found.base, found.config.unlearn.method) == (folder, None, "retrain")
+    meta = json.loads((folder / "meta.json").read_text())
+    (folder / "meta.json").write_text(json.dumps(meta | {"base": "x"}))
+    with pytest.raises(InputError, match=rf"control: base: found x; accepted: {info.base}, as in the unlearned run"):
+        read_control(folder, info, make_setup(info.config))
 
 
 def test_other_numbers_of_everything_are_other_evidence(run, printed, refused):
