@@ -10,7 +10,8 @@
 ## PRESET       cpu or paper (default: cpu)
 ## LIBRARY      folder of clips (default: data/ROBOT)
 ## BASE         the policy to start from (default: the shipped one; for pretrain and train, none)
-## BASES        the policies that sweep and experiments start from, comma-separated (default: every data/ROBOT/base*)
+## BASES        the policies that sweep and experiments start from, comma-separated (default: the shipped one; for
+##              experiments every data/ROBOT/base*)
 ## CONTROLS     retrained controls for the experiments, comma-separated (default: every data/ROBOT/control*)
 ## WITHOUT      clips that pretrain leaves out, comma-separated, which makes a retrained control (default: none)
 ## CHECKPOINT   the policy to evaluate, export, play or film (default: the shipped base)

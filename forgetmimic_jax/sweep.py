@@ -20,6 +20,7 @@ from forgetmimic_jax.studies.penalty import penalty_study
 from forgetmimic_jax.studies.samplers import sampler_study
 from forgetmimic_jax.studies.study import Document, Study, variants_study
 from forgetmimic_jax.studies.targets import targets_study
+from forgetmimic_jax.training.start import base_folder
 
 
 @dataclass(kw_only=True)
@@ -28,6 +29,8 @@ class Options(study_options.Options):
 
     kind: Annotated[Literal["lambda", "targets", "sampler", "seeds"], tyro.conf.Positional]
     """What the runs differ in: the penalty λ, the targets, sampler and wrench, or only the seed."""
+    bases: str | None = None
+    """Checkpoints that the runs start from, comma-separated; the shipped data/ROBOT/base by default."""
     values: list[str] = field(default_factory=list)
     """Penalties (by default 0.5 1 4 6 7 8 9 12 16), groups of targets (punch,kick dance_a,dance_b run) or samplers."""
     output: Path | None = None
@@ -65,6 +68,8 @@ STUDIES: dict[str, Callable[..., Study]] = {
 
 def main(options: Options) -> None:
     """Run the sweep."""
+    if not options.draw:
+        options.bases = options.bases or str(base_folder(options.robot))
     options.output = options.output or Path("runs") / f"sweep-{options.robot}-{options.kind}"
     make = STUDIES[options.kind]
     conduct(make(tuple(options.values)) if options.values else make(), options, "make experiments")

@@ -96,6 +96,8 @@ def test_with_several_bases_bounds_are_means_of_each_bases_seeds():
     found = finding_between("", between((8.0, 10.0), (9.0, 11.0), (10.0, 12.0)), 5.0, "", below=False)
     assert (found.word, found.n) == ("holds", 3)
     assert found.p == pytest.approx(stats.ttest_1samp([9.0, 10.0, 11.0], 5.0).pvalue)
+    found = finding_between("", between((8.0, 10.0), (9.0, 11.0), (10.0, 12.0)), 10.0, "", below=False)
+    assert (found.word, found.n, found.p) == ("open", 3, 1.0)
 
 
 def test_what_could_not_be_decided_counts_as_tested_only_where_it_was_measured():
