@@ -14,14 +14,15 @@ from forgetmimic_jax.studies.options import Options
 if TYPE_CHECKING:
     from forgetmimic_jax.training.checkpoint import CheckpointInfo
 
-ALIKE = ("observation", "action")  # sections of the settings: a study rolls its policies out in one environment
+# A study rolls its policies out in one environment, which these settings make; see `start.with_interface`.
+INTERFACE = ("observation.", "action.", "physics.self_collision")
 
 
 def find_bases(options: Options) -> tuple[CheckpointInfo, ...]:
     """The bases that a study names, or the shipped ones.
 
     Raises:
-        InputError: none, one of another robot, or one of other clips, observations or actions than the first.
+        InputError: none, one of another robot, or one of other clips, or of another interface than the first.
     """
     from forgetmimic_jax.training.checkpoint import read_info
     from forgetmimic_jax.training.start import base_folder, shipped_policies
@@ -81,7 +82,7 @@ def _check_alike(info: CheckpointInfo, first: CheckpointInfo) -> None:
     found: dict[str, Any] = {"robot": info.robot, "clips": info.clips, "library_hash": info.library_hash}
     needed: dict[str, Any] = {"robot": first.robot, "clips": first.clips, "library_hash": first.library_hash}
     for name in {**theirs, **ours}:
-        if name.startswith(tuple(f"{section}." for section in ALIKE)):
+        if name.startswith(INTERFACE):
             found[name], needed[name] = theirs.get(name), ours.get(name)
     for name, value in found.items():
         if value != needed[name]:
