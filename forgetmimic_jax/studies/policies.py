@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,8 +36,7 @@ def find_bases(options: Options) -> tuple[CheckpointInfo, ...]:
     infos = tuple(read_info(path) for path in paths)
     if infos[0].robot != options.robot:
         raise InputError(f"{infos[0].path}: robot: found '{infos[0].robot}'; --robot is '{options.robot}'")
-    for info in infos:
-        _check_alike(info, infos[0])
+    _check_alike(infos, infos[0])
     return infos
 
 
@@ -55,13 +54,13 @@ def find_controls(
 
     if options.controls is None:
         shipped = [read_info(path) for path in shipped_policies(options.robot, "control")]
-        alike = [info for info in shipped if info.library_hash == bases[0].library_hash]
+        alike = [info for info in shipped if not any(_differences(info, bases[0]))]
         return tuple(info for info in alike if set(info.config.unlearn.targets) == set(targets))[: len(bases)]
     infos = tuple(read_info(Path(name)) for name in comma_separated(options.controls))
     if len(infos) > len(bases):
         raise InputError(f"--controls: found {len(infos)}; accepted: one for each base at most, here {len(bases)}")
+    _check_alike(infos, bases[0])
     for info in infos:
-        _check_alike(info, bases[0])
         check_never_rolled_out(info, targets)
     return infos
 
@@ -76,14 +75,19 @@ def retrained_in_words(conditions: Mapping[str, Any]) -> str:
     )
 
 
-def _check_alike(info: CheckpointInfo, first: CheckpointInfo) -> None:
+def _check_alike(infos: Iterable[CheckpointInfo], first: CheckpointInfo) -> None:
     """InputError where a policy cannot stand beside the first base."""
+    for info in infos:
+        for name, found, needed in _differences(info, first):
+            raise InputError(f"{info.path}: {name}: found {found}; accepted: {needed}, as in {first.path}")
+
+
+def _differences(info: CheckpointInfo, first: CheckpointInfo) -> Iterator[tuple[str, Any, Any]]:
+    """What keeps two policies from one environment: its name, of the one, and of the other."""
+    for name in ("robot", "clips", "library_hash"):
+        if getattr(info, name) != getattr(first, name):
+            yield name, getattr(info, name), getattr(first, name)
     theirs, ours = by_name(info.config), by_name(first.config)
-    found: dict[str, Any] = {"robot": info.robot, "clips": info.clips, "library_hash": info.library_hash}
-    needed: dict[str, Any] = {"robot": first.robot, "clips": first.clips, "library_hash": first.library_hash}
     for name in {**theirs, **ours}:
-        if name.startswith(INTERFACE):
-            found[name], needed[name] = theirs.get(name), ours.get(name)
-    for name, value in found.items():
-        if value != needed[name]:
-            raise InputError(f"{info.path}: {name}: found {value}; accepted: {needed[name]}, as in {first.path}")
+        if name.startswith(INTERFACE) and theirs.get(name) != ours.get(name):
+            yield name, theirs.get(name), ours.get(name)

@@ -28,6 +28,7 @@ from forgetmimic_jax.studies.options import Options as StudyOptions
 from forgetmimic_jax.studies.targets import targets_study
 from forgetmimic_jax.studies.task import run_task
 from forgetmimic_jax.studies.variants import estimates, summary
+from forgetmimic_jax.training import start
 from forgetmimic_jax.training.checkpoint import policy_hash, read_info
 from forgetmimic_jax.unlearning.registry import unlearning_config
 
@@ -459,6 +460,20 @@ def test_a_control_stands_for_the_retrained_policy_and_is_evaluated_beside_its_b
     found = summary(trial.folder)
     assert found["policy"]["clips"] == found["base"]["clips"]  # of one policy on the same episodes
     assert found.keys() == {"policy", "base", "zero_action"}
+
+
+def test_shipped_bases_and_controls_are_found_without_a_flag(base_run, control, tmp_path, monkeypatch):
+    shipped = {"base": base_run.checkpoint(4), "base-1": base_run.checkpoint(2), "control": control}
+    for name, folder in shipped.items():
+        shutil.copytree(folder, tmp_path / "data" / "g1" / name)
+    monkeypatch.setattr(start, "DATA_DIR", tmp_path / "data")
+    of = Lab(options(StudyOptions, base_run, tmp_path, bases=None), iterations=2)
+    assert [info.path.name for info in of.bases] == ["base", "base-1"]
+    assert [info.path.name for info in of.controls] == ["control"]
+    assert list(of.retrained) == [Repeat(0, 0)]
+    assert of.trial({}, Repeat(1, 0)).folder != of.trial({}, Repeat(0, 0)).folder
+    other = Lab(options(StudyOptions, base_run, tmp_path, bases=None, targets="nod"), iterations=2)
+    assert other.controls == ()  # the shipped one is of other targets
 
 
 @pytest.mark.parametrize(
