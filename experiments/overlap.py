@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from forgetmimic_jax.training.checkpoint import CheckpointInfo
 
 SPLIT = "dance_a"
-# By target, the kept clip that shares its moves.
+# By target, the kept clip that shares its moves by name; by joint angles others may be nearer.
 NEIGHBOURS = {"kick": "spinkick", "walk": "run", f"{SPLIT}_first_half": f"{SPLIT}_second_half"}
 
 
@@ -42,7 +42,7 @@ def overlap_study(neighbours: Mapping[str, str] = NEIGHBOURS, split: str = SPLIT
     """The default run with each target, on the library with a clip in two halves.
 
     Args:
-        neighbours: by target, the kept clip that shares its moves.
+        neighbours: by target, the kept clip whose name says that it shares its moves.
         split: the clip that is cut in the middle.
     """
     return Study(
@@ -189,7 +189,8 @@ def body(document: Document) -> str:
     note = (
         "Retention: the kept clip's tracking (survival-weighted) over the base's on the same episodes. Distance: "
         "dynamic time warping of the joint angles, from each second of the kept clip to the target's nearest second, "
-        "mean over the kept clip. In bold: the clip that shares the target's moves.\n"
+        "mean over the kept clip. In bold: the clip whose name says that it shares the target's moves; by joint angles "
+        "others may be nearer.\n"
     )
     table = markdown_table(["target", "kept clip", "distance, rad", "retention"], rows)
     return f"{table}\n{note}\n{variant_table(results['variants'], {})}"
