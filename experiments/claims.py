@@ -12,6 +12,7 @@ from pathlib import Path
 
 from experiments import (
     comparison,
+    generality,
     heat_map,
     membership,
     motion_types,
@@ -47,6 +48,7 @@ STUDIES: Mapping[str, Study] = {
     "g1/relearning": relearning.STUDY,
     "g1/membership": membership.STUDY,
     "g1/overlap": overlap.STUDY,
+    "g1/generality": generality.STUDY,
 }
 
 

@@ -258,6 +258,7 @@ class Lab:
         *,
         episodes: int | None = None,
         seed: int = 0,
+        noise: bool = False,
     ) -> tuple[dict[Any, Rollout], tuple[str, ...]]:
         """Every policy on the same episodes, and the clips' names.
 
@@ -266,15 +267,15 @@ class Lab:
             clips: other clips than the library's.
             episodes: a clip; the study's by default.
             seed: of the episodes.
+            noise: with the randomisation, the pushes and the sensor noise of training.
         """
         from forgetmimic_jax.evaluation.rollout import Evaluator
         from forgetmimic_jax.motion.library import build_library
 
         setup = self._setup()
         library = setup.library if clips is None else build_library(setup.robot, clips)
-        evaluator = Evaluator(
-            dataclasses.replace(setup, library=library), episodes=episodes or self.options.episodes, seed=seed
-        )
+        setup = dataclasses.replace(setup, library=library)
+        evaluator = Evaluator(setup, episodes=episodes or self.options.episodes, seed=seed, noise=noise)
         rolled = {}
         with progress("roll out", len(policies)) as report:
             for done, (key, path) in enumerate(policies.items(), start=1):

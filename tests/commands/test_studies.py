@@ -19,6 +19,7 @@ from forgetmimic_jax import evaluate, sweep, unlearn
 from forgetmimic_jax.basics.errors import InputError, Interrupted
 from forgetmimic_jax.basics.provenance import provenance
 from forgetmimic_jax.evaluation.repeats import Repeat
+from forgetmimic_jax.motion.library import library_hash
 from forgetmimic_jax.settings.config import UnlearnConfig, load_config, save_config
 from forgetmimic_jax.settings.options import parse
 from forgetmimic_jax.studies import conduct, executor, trials
@@ -432,6 +433,24 @@ def test_overlap_forgets_the_half_of_a_clip_from_a_base_that_knew_the_whole(base
     page = (tmp_path / "out" / "overlap.md").read_text()
     assert "\nOurs, not in the paper: What lies near a target loses more than what lies far from it.\n" in page
     assert "\n| sway_first_half | **sway_second_half** | 0." in page
+
+
+def test_generality_rolls_the_bases_out_on_clips_that_they_never_saw(base_run, library_folder, tmp_path):
+    module = importlib.import_module("experiments.generality")
+    given = options(module.HeldOutOptions, base_run, tmp_path, held_out=str(library_folder))
+    finished(lambda given: conduct.conduct(module.STUDY, given, "make experiments"), given)
+    document = json.loads((tmp_path / "out" / "generality.json").read_text())
+    assert document["conditions"]["held_out"] == {library_folder.name: library_hash(library_folder)}
+    kinds = document["results"]["kinds"]
+    own, noise, mirrored, slower, faster, other = (of["base"]["base 0, seed 0"] for of in kinds.values())
+    assert list(own) == list(noise) == ["sway", "turn", "nod"]
+    assert list(mirrored) == ["sway_mirrored", "turn_mirrored", "nod_mirrored"]
+    assert (next(iter(slower)), next(iter(faster))) == ("sway_speed_0.75", "sway_speed_1.25")
+    assert own == other  # the library that was named is the base's own
+    assert own != noise
+    page = (tmp_path / "out" / "generality.md").read_text()
+    assert "\nOurs, not in the paper: A base completes most episodes of the mirror images of its clips" in page
+    assert "\n| mirror images | 3 | " in page
 
 
 @pytest.fixture
