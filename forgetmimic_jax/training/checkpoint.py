@@ -121,7 +121,7 @@ def _save(
         save_file(tensors, temporary / POLICY)
         (temporary / POLICY).chmod(0o644)
         if run is not None:
-            with ocp.StandardCheckpointer() as checkpointer:
+            with _orbax() as checkpointer:
                 checkpointer.save((temporary / RUN).resolve(), run)
             # Orbax notes there where the folder was written, which is nobody else's business; it is not read back.
             (temporary / RUN / "commit_success.txt").unlink(missing_ok=True)
@@ -313,7 +313,7 @@ def load_state(info: CheckpointInfo, template: TrainState) -> TrainState:
     _check_files(info, f"{RUN}/")
     abstract = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), _run_part(template))
     try:
-        with ocp.StandardCheckpointer() as checkpointer:
+        with _orbax() as checkpointer:
             restored = checkpointer.restore(folder.resolve(), abstract)
     except Exception as error:
         # Orbax reports another structure by many exception types; all of them mean the same to a user.
@@ -332,6 +332,13 @@ def load_state(info: CheckpointInfo, template: TrainState) -> TrainState:
         failure_level=jnp.asarray(_tensors(info)[FAILURE_LEVEL]),
         **restored,
     )
+
+
+def _orbax() -> ocp.StandardCheckpointer:
+    """Of this process alone: it waits for no other process of a training, each of which has its own folder."""
+    me = jax.process_index()
+    alone = ocp.options.MultiprocessingOptions(primary_host=me, active_processes={me})
+    return ocp.StandardCheckpointer(multiprocessing_options=alone)
 
 
 def _named(policy: Policy) -> dict[str, Any]:

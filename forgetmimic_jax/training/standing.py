@@ -15,6 +15,7 @@ from forgetmimic_jax.settings.config import UnlearnConfig, load_config
 from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.tracking.stand import STAND, stand_library
 from forgetmimic_jax.training.checkpoint import CONFIG, newest_checkpoint
+from forgetmimic_jax.training.devices import agreed
 from forgetmimic_jax.training.run import run
 
 SECONDS = 5.0  # of the stand
@@ -27,7 +28,7 @@ def stand_success(setup: Setup, policy: Policy | None) -> float:
     config = dataclasses.replace(setup.config, unlearn=UnlearnConfig())
     stand = dataclasses.replace(setup, config=config, library=_stand(setup), instead=None)
     rollout = Evaluator(stand, episodes=EPISODES, seed=setup.config.seed).rollout(policy)
-    return float((rollout.length == rollout.horizon).mean())
+    return agreed(float((rollout.length == rollout.horizon).mean()))
 
 
 def standing_teacher(setup: Setup, directory: Path) -> Policy:
