@@ -74,8 +74,12 @@ class Progress:
 
 
 def save_checkpoint(path: Path, setup: Setup, state: TrainState, progress: Progress) -> None:
-    """Write a run's whole state to folder `path`, for resuming; see `save_policy`."""
-    _save(path, setup, progress, state.policy, state.failure_level, state)
+    """Write a run's whole state to folder `path`, for resuming; see `save_policy`.
+
+    Of the processes of a training only the first one's folder is kept, so the others write no more than the policy.
+    """
+    whole = state if jax.process_index() == 0 else None
+    _save(path, setup, progress, state.policy, state.failure_level, whole)
 
 
 def save_policy(path: Path, setup: Setup, policy: Policy, failure_level: Array, progress: Progress) -> None:
@@ -335,7 +339,7 @@ def load_state(info: CheckpointInfo, template: TrainState) -> TrainState:
 
 
 def _orbax() -> ocp.StandardCheckpointer:
-    """Of this process alone: it waits for no other process of a training, each of which has its own folder."""
+    """Orbax in this process alone, which waits for no other process of a training."""
     me = jax.process_index()
     alone = ocp.options.MultiprocessingOptions(primary_host=me, active_processes={me})
     return ocp.StandardCheckpointer(multiprocessing_options=alone)

@@ -27,7 +27,8 @@ from forgetmimic_jax.basics.shards import AXIS
 from forgetmimic_jax.ppo.sharding import EVERYWHERE, PLACES
 from forgetmimic_jax.ppo.state import TrainState
 from forgetmimic_jax.settings.config import Config, validate
-from forgetmimic_jax.tracking.env import Assets
+from forgetmimic_jax.tracking.env import Assets, Environment, make_environment
+from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.tracking.stand import STAND
 
 T = TypeVar("T")
@@ -116,6 +117,12 @@ def own_folder(directory: Path) -> Path:
 def mesh_of(devices: int) -> Mesh | None:
     """The devices of a training, one shard each; None for a training on one device."""
     return Mesh(np.asarray(jax.devices()[:devices]), (AXIS,)) if devices > 1 else None
+
+
+def shard_environment(mesh: Mesh, setup: Setup, *, runs_on: float = 0.0) -> Environment:
+    """The environment of one shard of the mesh."""
+    robots = setup.config.ppo.num_envs // mesh.size
+    return make_environment(setup, robots, runs_on=runs_on, shards=len(mesh.local_devices))
 
 
 def spread(mesh: Mesh | None, state: TrainState) -> TrainState:

@@ -23,7 +23,7 @@ from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.training import checkpoint
 from forgetmimic_jax.training.checkpoint import Progress, checkpoints, newest_checkpoint
 from forgetmimic_jax.training.course import MakeCourse, Plain, Position
-from forgetmimic_jax.training.devices import anywhere, gathered, local, mesh_of, share, spread
+from forgetmimic_jax.training.devices import anywhere, gathered, local, mesh_of, shard_environment, share, spread
 from forgetmimic_jax.training.folder import prepare_folder
 from forgetmimic_jax.training.log import Log
 from forgetmimic_jax.training.start import another_machine, saved_state, start_state, steps_before, unlearned_base
@@ -58,9 +58,7 @@ def run(
     if mesh is None:
         iterate = make_iteration(env, method)
     else:
-        robots, here = config.ppo.num_envs // mesh.size, len(mesh.local_devices)
-        of_shard = make_environment(setup, robots, runs_on=method.runs_on, shards=here)
-        iterate = make_iteration(of_shard, method, mesh)
+        iterate = make_iteration(shard_environment(mesh, setup, runs_on=method.runs_on), method, mesh)
     directory.mkdir(parents=True, exist_ok=True)
     console = Console()
     if newest and (difference := another_machine(newest, config.devices)):
