@@ -125,6 +125,8 @@ def run(
 
 def interrupted(config: Config, directory: Path, command: str) -> Interrupted:
     """What a stopped run says at its end: what it saved, and the command that continues it."""
+    if jax.process_index() > 0:
+        return Interrupted("stopped with the first process, which saved")
     again = command_line(command, robot=config.robot, resume=True, output=directory)
     return Interrupted(f"stopped; saved {newest_checkpoint(directory)}; continue with: {again}")
 

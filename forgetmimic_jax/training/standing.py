@@ -51,7 +51,8 @@ def standing_teacher(setup: Setup, directory: Path) -> Policy:
     learning = _learning(setup)
     folder = directory.with_name(f"{directory.name}-{STAND}")
     resume = newest_checkpoint(folder) is not None
-    if resume and load_config(folder / CONFIG) != learning.config:
+    devices = learning.config.devices  # another number of them continues too
+    if resume and dataclasses.replace(load_config(folder / CONFIG), devices=devices) != learning.config:
         raise InputError(f"{folder}: is of a run with other settings; remove it, or choose another --output")
     try:
         _, state = run(learning, folder, description="learn to stand", resume=resume)
