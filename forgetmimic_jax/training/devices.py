@@ -57,7 +57,7 @@ def join(config: Config) -> None:
         raise InputError(f"--devices: found {devices}; accepted: a multiple of the {processes} processes")
     here = devices // processes
     # XLA's pool needs a thread for each device's program, which waits there for the others, and more for the work.
-    os.environ.setdefault("NPROC", str(cores() + here))
+    os.environ["NPROC"] = str(cores() + here)
     with contextlib.suppress(RuntimeError):  # JAX has started: its devices are what there is
         jax.config.update("jax_num_cpu_devices", here)
     if processes > 1:

@@ -138,7 +138,7 @@ def another_machine(path: Path, devices: int) -> str | None:
     """
     info, here = checkpoint.read_info(path), dataclasses.asdict(made_here())
     if info.config.devices != devices:
-        return f"{path} was made on devices: {info.config.devices}, this is on {devices}: the noise will be another"
+        return f"{path} was made with --devices {info.config.devices}, this run has {devices}: its noise will differ"
     before = info.made
     then, now = (f"{made.get('processor')} (cores: {made.get('cores')})" for made in (before, here))
     if not before or then == now:

@@ -177,7 +177,7 @@ def test_a_run_of_one_device_continues_in_two_processes_as_on_two_devices(runs, 
 
 def test_one_of_two_processes_prints_and_the_other_leaves_no_file(runs):
     first, second = runs.said
-    assert "was made on devices: 1, this is on 2: the noise will be another" in first
+    assert "was made with --devices 1, this run has 2: its noise will differ" in first
     assert f"checkpoint   {runs.continued.checkpoint(2 * ITERATIONS)}" in first
     assert second == ""
     assert [list(folder.iterdir()) for folder in runs.temporary] == [[], []]
@@ -202,7 +202,7 @@ def test_a_run_of_two_devices_continues_on_one(runs, setup, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(runs.two.folder, folder)
     resumed = finished(train.main, train.Options(output=folder, resume=True, devices=1, iterations=ITERATIONS + 1))
-    assert "was made on devices: 2, this is on 1: the noise will be another" in resumed.printed
+    assert "was made with --devices 2, this run has 1: its noise will differ" in resumed.printed
     assert int(newest_checkpoint(folder).name) == ITERATIONS + 1
     env = make_environment(setup, ENVS)
     iterate = run_module.make_iteration(env, method_of(setup.config))
