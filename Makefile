@@ -21,6 +21,7 @@
 ## NOISE        1 evaluates with randomisation, pushes and sensor noise
 ## RESUME       1 continues the run in OUTPUT
 ## SWEEP        lambda, targets, sampler or seeds (default: lambda)
+## DEVICES      devices that share one training, such as 4; for bench the numbers to compare, such as 1,2,4 (default: 1)
 ## CLUSTER      address of a dask scheduler whose workers run the trials of sweep and experiments (default: none)
 ## ARGS         flags as they are, and what comes before them; ARGS=--help lists all flags
 ## PYTHON       the Python that .venv is made from, 3.11 to 3.14 (default: the first found)

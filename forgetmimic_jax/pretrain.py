@@ -50,6 +50,8 @@ class Options:
     """Random seed; 0 by default."""
     physics: EngineName | None = None
     """Physics engine; auto is native on a CPU and mjx on a GPU or TPU."""
+    devices: int | None = None
+    """Devices that share the environments: GPUs, or on a CPU parts of its cores; 1 by default (docs/cluster.md)."""
     library: Path | None = None
     """Folder of clips; data/ROBOT by default."""
     base: Path | None = None
@@ -70,6 +72,7 @@ def main(options: Options) -> None:
     """Pretrain, and say where the policy is."""
     from forgetmimic_jax.basics.console import closing, command_line
     from forgetmimic_jax.tracking.setup import make_setup
+    from forgetmimic_jax.training.devices import join, own_folder
     from forgetmimic_jax.training.folder import BEST, prepare_folder
     from forgetmimic_jax.training.pretraining import Pretraining
     from forgetmimic_jax.training.run import run
@@ -77,6 +80,8 @@ def main(options: Options) -> None:
     output = options.output or Path("runs") / f"pretrain-{options.robot}{'-control' if options.without else ''}"
     prepare_folder(output, resume=options.resume)
     config = config_of(options, output)
+    join(config)
+    output = own_folder(output)
     setup = make_setup(config)
     if not options.resume:
         warn_of_infeasible(setup)
@@ -113,7 +118,8 @@ def config_of(options: Options, output: Path) -> Config:
         config = with_interface_of_base(config)
         if without:
             config = unlearning_config(config, UnlearnConfig(without, "retrain"))
-    config = override(replace_given(config, iterations=options.iterations), itertools.chain(*options.set))
+    config = replace_given(config, iterations=options.iterations, devices=options.devices)
+    config = override(config, itertools.chain(*options.set))
     every, save = config.evaluate_every, config.checkpoint_every
     if not every or every % save:
         raise InputError(

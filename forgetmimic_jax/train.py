@@ -25,6 +25,8 @@ class Options:
     """Random seed; 0 by default."""
     physics: EngineName | None = None
     """Physics engine; auto is native on a CPU and mjx on a GPU or TPU."""
+    devices: int | None = None
+    """Devices that share the environments: GPUs, or on a CPU parts of its cores; 1 by default (docs/cluster.md)."""
     library: Path | None = None
     """Folder of clips; data/ROBOT by default."""
     base: Path | None = None
@@ -43,6 +45,7 @@ def main(options: Options) -> None:
     from forgetmimic_jax.basics.console import closing, command_line
     from forgetmimic_jax.settings.config import load_config, preset
     from forgetmimic_jax.tracking.setup import make_setup
+    from forgetmimic_jax.training.devices import join, own_folder
     from forgetmimic_jax.training.folder import BEST, prepare_folder
     from forgetmimic_jax.training.run import run
     from forgetmimic_jax.training.start import with_interface_of_base
@@ -61,8 +64,11 @@ def main(options: Options) -> None:
             base=options.base,
         )
         config = with_interface_of_base(config)
-    config = override(replace_given(config, iterations=options.iterations), itertools.chain(*options.set))
-    setup = make_setup(on_engine(config, options.physics))
+    config = replace_given(config, iterations=options.iterations, devices=options.devices)
+    config = on_engine(override(config, itertools.chain(*options.set)), options.physics)
+    join(config)
+    output = own_folder(output)
+    setup = make_setup(config)
     path, _ = run(setup, output, description=f"train {config.robot}", resume=options.resume)
     best = output / BEST
     files = {"checkpoint": path}

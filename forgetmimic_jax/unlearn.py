@@ -19,6 +19,7 @@ def main(options: Options) -> None:
     from forgetmimic_jax.training import checkpoint
     from forgetmimic_jax.training.comparison import completes_nothing, subject
     from forgetmimic_jax.training.course import Plain
+    from forgetmimic_jax.training.devices import join, own_folder
     from forgetmimic_jax.training.folder import default_folder, prepare_folder
     from forgetmimic_jax.training.run import interrupted, run
     from forgetmimic_jax.training.standing import standing_teacher
@@ -33,6 +34,8 @@ def main(options: Options) -> None:
     config = config_of(options, output)
     if not config.unlearn.targets:
         raise InputError("--targets: no clip named; name at least one to forget, such as --targets punch,kick")
+    join(config)
+    output = own_folder(output)
     setup = make_setup(config)
     base = base_policy(setup)
     setup = dataclasses.replace(setup, base=base)

@@ -16,13 +16,13 @@ def resolve_engine(name: EngineName) -> str:
     return "native" if jax.default_backend() == "cpu" else "mjx"
 
 
-def make_engine(robot: Robot, config: PhysicsConfig, num_envs: int) -> Engine:
-    """The engine that `config.engine` names, for a batch of `num_envs` robots."""
+def make_engine(robot: Robot, config: PhysicsConfig, num_envs: int, shards: int = 1) -> Engine:
+    """The engine that `config.engine` names, for a batch of `num_envs` robots on each of this process's shards."""
     name = resolve_engine(config.engine)
     if name == "native":
         from forgetmimic_jax.physics.native import NativeEngine
 
-        return NativeEngine(robot, config.substeps, num_envs)
+        return NativeEngine(robot, config.substeps, num_envs, shards=shards)
     from forgetmimic_jax.physics.mjx import MjxEngine
 
     return MjxEngine(robot, config.substeps, implementation="warp" if name == "mjx-warp" else "jax")

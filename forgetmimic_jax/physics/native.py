@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
-import threading
+import queue
+from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
@@ -26,20 +28,15 @@ from forgetmimic_jax.robot.model import Robot
 VELOCITY_STAGE = int(mujoco.mjtStage.mjSTAGE_VEL)
 
 
-class NativeEngine:
-    """A `mujoco.batch.Batch` whose rows are only scratch: every call loads the state it is given.
+class HostBatch:
+    """A `mujoco.batch.Batch` whose rows are only scratch: every call, one at a time, loads the state it is given."""
 
-    Purity is what allows `jax.pure_callback`: nothing of one call is felt by the next. Under `vmap`, as of a whole
-    iteration over several trainings, the members are stepped one after the other.
-    """
-
-    def __init__(self, robot: Robot, substeps: int, num_envs: int, num_threads: int = 0):
+    def __init__(self, robot: Robot, substeps: int, num_envs: int, num_threads: int):
         model = copy.copy(robot.model)
         # A diverged simulation must show as NaN, to be counted; MuJoCo's own reset would hide it.
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         mujoco.set_mju_user_warning(lambda message: None)
-        self._batch = mujoco.batch.Batch(model, num_envs, num_threads or cores())
-        self._lock = threading.Lock()
+        self._batch = mujoco.batch.Batch(model, num_envs, num_threads)
         self._substeps = substeps
         self._keys = robot.key_body_ids
         self._anchor = robot.anchor_body_id
@@ -52,49 +49,32 @@ class NativeEngine:
         }
         self._friction = self._batch.expand("geom_friction")
         self._body_ipos = self._batch.expand("body_ipos")
-        keys = len(self._keys)
 
-        def shape(*dims: int) -> jax.ShapeDtypeStruct:
-            return jax.ShapeDtypeStruct((num_envs, *dims), jnp.float32)
+    def step(self, arguments) -> tuple[np.ndarray, ...]:
+        """A control step of all rows."""
+        *loaded, joint_target, wrench = (np.asarray(x) for x in arguments)
+        # What overflows float32 has diverged, and shows as infinity: no warning on the user's screen.
+        with np.errstate(over="ignore"):
+            batch = self._batch
+            self._load(self._everyone, *loaded)
+            batch.ctrl[:] = joint_target
+            batch.xfrc_applied[:, self._anchor] = wrench
+            seen = self._advance()
+            force = -self._outputs["sensordata"][:, self._contact_columns].astype(np.float32)
+            new = tuple(x.astype(np.float32) for x in (batch.qpos, batch.qvel, batch.qacc_warmstart))
+            return (*new, *self._bodies(self._everyone), force, *seen)
 
-        self._state_shapes = (shape(model.nq), shape(model.nv), shape(model.nv))
-        self._body_shapes = (shape(keys, 3), shape(keys, 4), shape(keys, 6), shape(3))
-        self._force_shape = shape(keys, 3)
-        self._seen_shapes: tuple[jax.ShapeDtypeStruct, ...] = ()
-
-    def step(
-        self, state: PhysicsState, parameters: PhysicsParameters, joint_target: Array, wrench: Array
-    ) -> tuple[PhysicsState, BodyState]:
-        """See `Engine.step`."""
-        return self._stepped(state, parameters, joint_target, wrench)[:2]
-
-    def forward(self, state: PhysicsState, parameters: PhysicsParameters, mask: Array, bodies: BodyState) -> BodyState:
-        """See `Engine.forward`."""
-        xpos, xquat, cvel, com = jax.pure_callback(
-            self._forward_host,
-            self._body_shapes,
-            (state.qpos, state.qvel, state.warmstart, parameters.foot_friction, parameters.torso_com, mask),
-            vmap_method="sequential",
-        )
-        fresh = body_state(xpos, xquat, cvel, com, jnp.zeros_like(bodies.contact_force))
-        return select_rows(mask, fresh, bodies)
-
-    def _stepped(
-        self, state: PhysicsState, parameters: PhysicsParameters, joint_target: Array, wrench: Array
-    ) -> tuple[PhysicsState, BodyState, list[Array]]:
-        """The results of `Engine.step`, and what `_advance` saw."""
-        shapes = (*self._state_shapes, *self._body_shapes, self._force_shape, *self._seen_shapes)
-        loaded = (state.qpos, state.qvel, state.warmstart, parameters.foot_friction, parameters.torso_com)
-        qpos, qvel, warmstart, xpos, xquat, cvel, com, force, *seen = jax.pure_callback(
-            self._step_host,
-            shapes,
-            (*loaded, joint_target, wrench),
-            vmap_method="sequential",
-        )
-        return PhysicsState(qpos, qvel, warmstart), body_state(xpos, xquat, cvel, com, force), seen
+    def forward(self, arguments) -> tuple[np.ndarray, ...]:
+        """The bodies of the rows in a mask, which is the last argument."""
+        *loaded, mask = (np.asarray(x) for x in arguments)
+        rows = np.flatnonzero(mask)
+        if rows.size:
+            self._load(rows, *loaded)
+            self._batch.forward(ids=rows.astype(np.int32), stage=VELOCITY_STAGE)
+        return self._bodies(rows)
 
     def _advance(self) -> tuple[np.ndarray, ...]:
-        """The physics steps of one control step; returns what is to be seen of them, in the shapes `_seen_shapes`."""
+        """The physics steps of one control step; returns what is to be seen of them, in the engine's `_seen_shapes`."""
         self._batch.step(nstep=self._substeps, stage=VELOCITY_STAGE)
         return ()
 
@@ -110,29 +90,94 @@ class NativeEngine:
     def _bodies(self, rows) -> tuple[np.ndarray, ...]:
         """Key-body fields of `rows`; the other rows are zero."""
         fields = (("xpos", self._keys), ("xquat", self._keys), ("cvel", self._keys), ("subtree_com", 1))
-        arrays = tuple(np.zeros(shape.shape, np.float32) for shape in self._body_shapes)
+        count, keys = len(self._batch.qpos), len(self._keys)
+        arrays = tuple(np.zeros((count, *dims), np.float32) for dims in body_dims(keys))
         for array, (name, columns) in zip(arrays, fields, strict=True):
             array[rows] = self._outputs[name][rows][:, columns]
         return arrays
 
-    def _step_host(self, arguments) -> tuple[np.ndarray, ...]:
-        *loaded, joint_target, wrench = (np.asarray(x) for x in arguments)
-        # What overflows float32 has diverged, and shows as infinity: no warning on the user's screen.
-        with self._lock, np.errstate(over="ignore"):
-            batch = self._batch
-            self._load(self._everyone, *loaded)
-            batch.ctrl[:] = joint_target
-            batch.xfrc_applied[:, self._anchor] = wrench
-            seen = self._advance()
-            force = -self._outputs["sensordata"][:, self._contact_columns].astype(np.float32)
-            new = tuple(x.astype(np.float32) for x in (batch.qpos, batch.qvel, batch.qacc_warmstart))
-            return (*new, *self._bodies(self._everyone), force, *seen)
 
-    def _forward_host(self, arguments) -> tuple[np.ndarray, ...]:
-        *loaded, mask = (np.asarray(x) for x in arguments)
-        with self._lock:
-            rows = np.flatnonzero(mask)
-            if rows.size:
-                self._load(rows, *loaded)
-                self._batch.forward(ids=rows.astype(np.int32), stage=VELOCITY_STAGE)
-            return self._bodies(rows)
+def body_dims(keys: int) -> tuple[tuple[int, ...], ...]:
+    """Dimensions of position, quaternion, velocity and centre of mass of one robot with `keys` key bodies."""
+    return (keys, 3), (keys, 4), (keys, 6), (3,)
+
+
+class NativeEngine:
+    """Batches of MuJoCo's own, behind a callback that is pure: nothing of one call is felt by the next.
+
+    Under `vmap`, as of a whole iteration over several trainings, the members are stepped one after the other. The
+    shards of a training step at the same time, each in a batch that no other one uses then, with its own threads.
+
+    Args:
+        robot: what is simulated.
+        substeps: physics steps of a control step.
+        num_envs: robots of a batch.
+        num_threads: threads of a batch; by default its part of the cores.
+        shards: batches that step at the same time.
+    """
+
+    host: type[HostBatch] = HostBatch
+
+    def __init__(self, robot: Robot, substeps: int, num_envs: int, num_threads: int = 0, shards: int = 1):
+        threads = num_threads or max(1, cores() // shards)
+        self._free: queue.SimpleQueue[HostBatch] = queue.SimpleQueue()
+        for _ in range(shards):
+            self._free.put(self.host(robot, substeps, num_envs, threads))
+        model = robot.model
+
+        def shape(*dims: int) -> jax.ShapeDtypeStruct:
+            return jax.ShapeDtypeStruct((num_envs, *dims), jnp.float32)
+
+        keys = len(robot.key_body_ids)
+        self._state_shapes = (shape(model.nq), shape(model.nv), shape(model.nv))
+        self._body_shapes = tuple(shape(*dims) for dims in body_dims(keys))
+        self._force_shape = shape(keys, 3)
+        self._seen_shapes: tuple[jax.ShapeDtypeStruct, ...] = ()
+
+    def step(
+        self, state: PhysicsState, parameters: PhysicsParameters, joint_target: Array, wrench: Array
+    ) -> tuple[PhysicsState, BodyState]:
+        """See `Engine.step`."""
+        return self._stepped(state, parameters, joint_target, wrench)[:2]
+
+    def forward(self, state: PhysicsState, parameters: PhysicsParameters, mask: Array, bodies: BodyState) -> BodyState:
+        """See `Engine.forward`."""
+        xpos, xquat, cvel, com = jax.pure_callback(
+            self._forward,
+            self._body_shapes,
+            (state.qpos, state.qvel, state.warmstart, parameters.foot_friction, parameters.torso_com, mask),
+            vmap_method="sequential",
+        )
+        fresh = body_state(xpos, xquat, cvel, com, jnp.zeros_like(bodies.contact_force))
+        return select_rows(mask, fresh, bodies)
+
+    def _stepped(
+        self, state: PhysicsState, parameters: PhysicsParameters, joint_target: Array, wrench: Array
+    ) -> tuple[PhysicsState, BodyState, list[Array]]:
+        """The results of `Engine.step`, and what the batch saw besides."""
+        shapes = (*self._state_shapes, *self._body_shapes, self._force_shape, *self._seen_shapes)
+        loaded = (state.qpos, state.qvel, state.warmstart, parameters.foot_friction, parameters.torso_com)
+        qpos, qvel, warmstart, xpos, xquat, cvel, com, force, *seen = jax.pure_callback(
+            self._step,
+            shapes,
+            (*loaded, joint_target, wrench),
+            vmap_method="sequential",
+        )
+        return PhysicsState(qpos, qvel, warmstart), body_state(xpos, xquat, cvel, com, force), seen
+
+    def _step(self, arguments) -> tuple[np.ndarray, ...]:
+        with self._batch() as batch:
+            return batch.step(arguments)
+
+    def _forward(self, arguments) -> tuple[np.ndarray, ...]:
+        with self._batch() as batch:
+            return batch.forward(arguments)
+
+    @contextlib.contextmanager
+    def _batch(self) -> Iterator[HostBatch]:
+        """A batch that nobody else uses inside."""
+        batch = self._free.get()
+        try:
+            yield batch
+        finally:
+            self._free.put(batch)

@@ -7,6 +7,8 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
+from forgetmimic_jax.basics.shards import moments, shards
+
 VARIANCE_FLOOR = 1e-6  # added to an observation's variance before the division by its root
 OBSERVATION_LIMIT = 10.0  # standard deviations
 MAX_COUNT = 1e8  # past it the statistics forget slowly instead of freezing
@@ -35,13 +37,13 @@ class Normalizer:
         return jnp.clip(scaled, -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
 
     def updated(self, observation: Array) -> Normalizer:
-        """The statistics after a batch [..., features] (Chan et al. 1983, parallel variance).
+        """The statistics after a batch [..., features] of every shard (Chan et al. 1983, parallel variance).
 
         A feature that never varied, such as the wrench of a training without one, starts anew when it first varies.
         """
         flat = observation.reshape(-1, observation.shape[-1])
-        count = jnp.float32(flat.shape[0])
-        mean, variance = flat.mean(0), flat.var(0)
+        count = jnp.float32(shards() * flat.shape[0])
+        mean, variance = moments(flat, axis=0)
         before = jnp.where(self.variance > 0.0, self.count, 0.0)
         total = before + count
         shift = mean - self.mean

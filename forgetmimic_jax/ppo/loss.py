@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
+from forgetmimic_jax.basics.shards import average, shards, total
 from forgetmimic_jax.policy.gaussian import entropy, kl_divergence, log_prob
 from forgetmimic_jax.ppo.transition import Transition
 from forgetmimic_jax.settings.config import Config, PPOConfig
@@ -83,21 +84,26 @@ def value_loss(
 
 
 def mean(values: Array, weight: Array | None) -> Array:
-    """Mean [] of values [batch] under weights or a mask [batch]; 0 where nothing has weight."""
+    """Mean [] of values [batch] under weights or a mask [batch]; 0 where nothing has weight.
+
+    On several shards it is this shard's part: the average of the parts is the mean over all of the steps.
+    """
     if weight is None:
         return values.mean()
-    return (values * weight).sum() / jnp.maximum(weight.sum(), 1.0)
+    return (values * weight).sum() / jnp.maximum(average(weight.sum()), 1.0 / shards())
 
 
 def equal_share(group: Array, groups: int) -> Array:
     """Weights [...], 1 on average, that give every group which is there the same sum, whatever its size.
 
+    Sizes and sums are over all shards.
+
     Args:
         group: i32[...] from 0.
         groups: how many there may be.
     """
-    size = jnp.zeros(groups).at[group.reshape(-1)].add(1.0)
-    return group.size / ((size > 0).sum() * size[group])
+    size = total(jnp.zeros(groups).at[group.reshape(-1)].add(1.0))
+    return shards() * group.size / ((size > 0).sum() * size[group])
 
 
 def adapt_learning_rate(

@@ -12,7 +12,9 @@ import jax
 import jax.numpy as jnp
 import optax
 from jax import Array
+from jax.sharding import Mesh
 
+from forgetmimic_jax.basics.shards import average, moments, total
 from forgetmimic_jax.policy.gaussian import kl_divergence
 from forgetmimic_jax.policy.policy import Policy, bound_std
 from forgetmimic_jax.ppo.collect import collect, draw_states
@@ -20,6 +22,7 @@ from forgetmimic_jax.ppo.gae import centre_branches, generalized_advantages
 from forgetmimic_jax.ppo.log import rollout_metrics
 from forgetmimic_jax.ppo.loss import Batch, Prediction, adapt_learning_rate, equal_share, trapezoid
 from forgetmimic_jax.ppo.rule import Rule
+from forgetmimic_jax.ppo.sharding import on_shards
 from forgetmimic_jax.ppo.state import TrainState, make_optimizer
 from forgetmimic_jax.ppo.transition import Outcome, Transition
 from forgetmimic_jax.settings.config import Config, PPOConfig
@@ -30,8 +33,13 @@ from forgetmimic_jax.tracking.rsi import update_failure_level
 Metrics = dict[str, Array]
 
 
-def make_iteration(env: Environment, rule: Rule) -> Callable[[Assets, TrainState], tuple[TrainState, Metrics]]:
-    """The jitted iteration(assets, state) → (state, metrics) under a training rule; the state is donated."""
+def make_iteration(
+    env: Environment, rule: Rule, mesh: Mesh | None = None
+) -> Callable[[Assets, TrainState], tuple[TrainState, Metrics]]:
+    """The jitted iteration(assets, state) → (state, metrics) under a training rule; the state is donated.
+
+    With a mesh, `env` is that of one of its shards.
+    """
 
     def on_rollout(assets: Assets, state: TrainState) -> tuple[TrainState, Metrics]:
         state, transition, outcome = collect(env, assets, state, rule)
@@ -51,7 +59,8 @@ def make_iteration(env: Environment, rule: Rule) -> Callable[[Assets, TrainState
         metrics = losses | rollout_metrics(env.config, assets, state, transition.clip, None)
         return dataclasses.replace(state, iteration=state.iteration + 1), metrics
 
-    return jax.jit(on_rollout if rule.simulate else on_drawn_states, donate_argnums=1)
+    iteration = on_rollout if rule.simulate else on_drawn_states
+    return jax.jit(iteration if mesh is None else on_shards(iteration, mesh), donate_argnums=1)
 
 
 def advantages(config: PPOConfig, gae_lambda: Array, outcome: Outcome) -> tuple[Array, Array]:
@@ -73,12 +82,13 @@ def advantages(config: PPOConfig, gae_lambda: Array, outcome: Outcome) -> tuple[
 def make_batch(
     config: Config, assets: Assets, transition: Transition, value: Array, advantage: Array, value_target: Array
 ) -> Batch:
-    """The steps [time · env] that the mini-batches are drawn from, advantages normalised over all of them."""
+    """The steps [time · env] that the mini-batches are drawn from, advantages normalised over those of all shards."""
+    mean, variance = moments(advantage)
     weight = equal_share(transition.clip, len(assets.is_target)) if config.ppo.equal_clips else jnp.ones_like(value)
     batch = Batch(
         transition=transition,
         value=value,
-        advantage=(advantage - advantage.mean()) / (advantage.std() + 1e-8),
+        advantage=(advantage - mean) / (jnp.sqrt(variance) + 1e-8),
         value_target=value_target,
         is_target=assets.is_target[transition.clip],
         weight=weight,
@@ -100,7 +110,7 @@ def _at_every_step(prediction: Prediction) -> Prediction:
 
 
 def improve(run: Config, focus: Focus, state: TrainState, batch: Batch, rule: Rule) -> tuple[TrainState, Metrics]:
-    """Epochs of mini-batch gradient steps."""
+    """Epochs of mini-batch gradient steps; a mini-batch is one of every shard, and its gradient their average."""
     config, policy = run.ppo, state.policy
     optimizer = make_optimizer(config)
     size = len(batch.value)
@@ -117,7 +127,7 @@ def improve(run: Config, focus: Focus, state: TrainState, batch: Batch, rule: Ru
     def minibatch(carry, indices: Array):
         parameters, optimizer_state, learning_rate = carry
         data = jax.tree.map(lambda x: x[indices], batch)
-        gradient, metrics = jax.grad(loss_of, has_aux=True)(parameters, data)
+        gradient, metrics = average(jax.grad(loss_of, has_aux=True)(parameters, data))
         if config.schedule == "adaptive":
             learning_rate = adapt(learning_rate, metrics["kl"])
         metrics["gradient_norm"] = optax.tree.norm(gradient)
@@ -175,5 +185,5 @@ def learn_sampler(config: Config, state: TrainState, clip: Array, outcome: Outco
     failure_level = update_failure_level(
         config.sampling, state.failure_level, outcome.done, outcome.failure, clip, outcome.start_bin
     )
-    diverged = state.diverged + outcome.diverged.sum().astype(jnp.int32)
+    diverged = state.diverged + total(outcome.diverged.sum().astype(jnp.int32))
     return dataclasses.replace(state, failure_level=failure_level, diverged=diverged)

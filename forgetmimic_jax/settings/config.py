@@ -239,6 +239,7 @@ class Config:
     evaluate_every: Period = 0  # iterations between evaluations during training; 0: none
     evaluate_episodes: Count = 6  # a clip in each of them: enough to see a trend, not to report
     max_episode_steps: Count = 500  # 10 s
+    devices: Count = 1  # that share the environments, each with noise of its own
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
     observation: ObservationConfig = field(default_factory=ObservationConfig)
     action: ActionConfig = field(default_factory=ActionConfig)
@@ -315,6 +316,12 @@ def validate(config: Config) -> None:
         )
     if ppo.num_envs % ppo.branches:
         raise InputError(f"ppo.branches: found {ppo.branches}; accepted: a divisor of num_envs = {ppo.num_envs}")
+    groups = ppo.num_envs // ppo.branches
+    if groups % config.devices:
+        raise InputError(f"devices: found {config.devices}; accepted: a divisor of num_envs / branches = {groups}")
+    steps = ppo.num_envs * ppo.num_steps // config.devices
+    if steps < ppo.minibatches:
+        raise InputError(f"ppo.minibatches: found {ppo.minibatches}; accepted: 1 to {steps}, the steps of each device")
 
 
 def to_dict(config: Config) -> dict[str, Any]:
@@ -340,6 +347,8 @@ def config_hash(config: Config) -> str:
     content = to_dict(config)
     for neutral in ("base", "checkpoint_every", "evaluate_every", "evaluate_episodes", "iterations", "pretrain"):
         content.pop(neutral)
+    if config.devices == 1:  # the hash of a run on one device does not know that there may be more
+        content.pop("devices")
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 

@@ -105,7 +105,9 @@ class Environment:
         return float(self.robot.model.geom_friction[self.robot.foot_geom_ids[0], 0])
 
 
-def make_environment(setup: Setup, num_envs: int, *, noisy: bool | None = None, runs_on: float = 0.0) -> Environment:
+def make_environment(
+    setup: Setup, num_envs: int, *, noisy: bool | None = None, runs_on: float = 0.0, shards: int = 1
+) -> Environment:
     """An environment of `num_envs` robots.
 
     Args:
@@ -114,11 +116,12 @@ def make_environment(setup: Setup, num_envs: int, *, noisy: bool | None = None, 
         noisy: by default the config's.
         runs_on: s that an episode of a target clip lasts after the clip's end, with the last frame held. Above 0, such
             an episode is terminated by a fall only.
+        shards: of this process, each with `num_envs` robots, that step at the same time.
     """
     config, robot = setup.config, setup.robot
     assisted = config.wrench.max_gain > 0
     physics = dataclasses.replace(config.physics, substeps=1) if assisted else config.physics  # see `_simulate`
-    engine = make_engine(robot, physics, num_envs)
+    engine = make_engine(robot, physics, num_envs, shards)
     noisy = config.noise.enabled if noisy is None else noisy
     return Environment(config, robot, engine, num_envs, noisy, round(runs_on / config.physics.control_step))
 

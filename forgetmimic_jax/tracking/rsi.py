@@ -11,6 +11,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
+from forgetmimic_jax.basics.shards import total
 from forgetmimic_jax.motion.library import MotionLibrary
 from forgetmimic_jax.settings.config import SamplingConfig
 
@@ -123,7 +124,7 @@ def episode_failure(config: SamplingConfig, tracking_sum: Array, steps: Array, h
 def update_failure_level(
     config: SamplingConfig, failure_level: Array, done: Array, failure: Array, clip: Array, index: Array
 ) -> Array:
-    """L [clip, bin] after a batch of ended episodes, each credited to its start bin.
+    """L [clip, bin] after a batch of ended episodes of every shard, each credited to its start bin.
 
     The paper's EMA is per episode. k episodes of mean f̄ give L ← (1−α)^k L + (1 − (1−α)^k) f̄, so the time constant
     in episodes does not depend on how many end at once.
@@ -141,7 +142,10 @@ def update_failure_level(
     num_bins = failure_level.shape[1]
     flat = (clip * num_bins + index).reshape(-1)
     ended = done.reshape(-1).astype(jnp.float32)
-    count = jax.ops.segment_sum(ended, flat, failure_level.size).reshape(failure_level.shape)
-    total = jax.ops.segment_sum(ended * failure.reshape(-1), flat, failure_level.size).reshape(failure_level.shape)
+
+    def by_bin(values: Array) -> Array:
+        return total(jax.ops.segment_sum(values, flat, failure_level.size).reshape(failure_level.shape))
+
+    count, failures = by_bin(ended), by_bin(ended * failure.reshape(-1))
     keep = (1.0 - config.smoothing) ** count
-    return keep * failure_level + (1.0 - keep) * total / jnp.maximum(count, 1.0)
+    return keep * failure_level + (1.0 - keep) * failures / jnp.maximum(count, 1.0)

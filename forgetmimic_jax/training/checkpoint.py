@@ -74,8 +74,12 @@ class Progress:
 
 
 def save_checkpoint(path: Path, setup: Setup, state: TrainState, progress: Progress) -> None:
-    """Write a run's whole state to folder `path`, for resuming; see `save_policy`."""
-    _save(path, setup, progress, state.policy, state.failure_level, state)
+    """Write a run's whole state to folder `path`, for resuming; see `save_policy`.
+
+    Of the processes of a training only the first one's folder is kept, so the others write no more than the policy.
+    """
+    whole = state if jax.process_index() == 0 else None
+    _save(path, setup, progress, state.policy, state.failure_level, whole)
 
 
 def save_policy(path: Path, setup: Setup, policy: Policy, failure_level: Array, progress: Progress) -> None:
@@ -121,7 +125,7 @@ def _save(
         save_file(tensors, temporary / POLICY)
         (temporary / POLICY).chmod(0o644)
         if run is not None:
-            with ocp.StandardCheckpointer() as checkpointer:
+            with _orbax() as checkpointer:
                 checkpointer.save((temporary / RUN).resolve(), run)
             # Orbax notes there where the folder was written, which is nobody else's business; it is not read back.
             (temporary / RUN / "commit_success.txt").unlink(missing_ok=True)
@@ -313,7 +317,7 @@ def load_state(info: CheckpointInfo, template: TrainState) -> TrainState:
     _check_files(info, f"{RUN}/")
     abstract = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), _run_part(template))
     try:
-        with ocp.StandardCheckpointer() as checkpointer:
+        with _orbax() as checkpointer:
             restored = checkpointer.restore(folder.resolve(), abstract)
     except Exception as error:
         # Orbax reports another structure by many exception types; all of them mean the same to a user.
@@ -332,6 +336,13 @@ def load_state(info: CheckpointInfo, template: TrainState) -> TrainState:
         failure_level=jnp.asarray(_tensors(info)[FAILURE_LEVEL]),
         **restored,
     )
+
+
+def _orbax() -> ocp.StandardCheckpointer:
+    """Orbax in this process alone, which waits for no other process of a training."""
+    me = jax.process_index()
+    alone = ocp.options.MultiprocessingOptions(primary_host=me, active_processes={me})
+    return ocp.StandardCheckpointer(multiprocessing_options=alone)
 
 
 def _named(policy: Policy) -> dict[str, Any]:

@@ -40,6 +40,7 @@ from forgetmimic_jax.training.curriculum import (
     advance,
     settings_of,
 )
+from forgetmimic_jax.training.devices import agreed
 from forgetmimic_jax.training.distil import DistilConfig, begin, distil
 from forgetmimic_jax.training.folder import BEST
 from forgetmimic_jax.training.search import SearchConfig, first_failures, search
@@ -47,6 +48,7 @@ from forgetmimic_jax.training.teaching import Lesson, PolicyTeacher, make_teachi
 from forgetmimic_jax.training.watch import Watch
 
 POLICIES = "policies"
+MEASURED = ("success_rate", "survival_weighted_tracking", "episode_length")  # in the order of `Measured`
 
 
 class Pretraining:
@@ -109,7 +111,7 @@ class Pretraining:
         policy, now = position.state.policy, self._curriculum
         row = self._watch.measure(policy, position.iteration, position.environment_steps)
         found = {
-            name: Measured(of["success_rate"], of["survival_weighted_tracking"], of["episode_length"])
+            name: Measured(*(agreed(of[field]) for field in MEASURED))
             for name, of in row["clips"].items()
             if name in now.clips
         }

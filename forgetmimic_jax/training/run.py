@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import jax
@@ -22,6 +23,7 @@ from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.training import checkpoint
 from forgetmimic_jax.training.checkpoint import Progress, checkpoints, newest_checkpoint
 from forgetmimic_jax.training.course import MakeCourse, Plain, Position
+from forgetmimic_jax.training.devices import anywhere, gathered, local, mesh_of, shard_environment, share, spread
 from forgetmimic_jax.training.folder import prepare_folder
 from forgetmimic_jax.training.log import Log
 from forgetmimic_jax.training.start import another_machine, saved_state, start_state, steps_before, unlearned_base
@@ -52,20 +54,31 @@ def run(
     else:
         state, environment_steps = saved_state(setup, env, assets, newest)
         now = Position(state, assets, int(state.iteration), environment_steps)
-    iterate = make_iteration(env, method)
+    mesh = mesh_of(config.devices)
+    if mesh is None:
+        iterate = make_iteration(env, method)
+    else:
+        iterate = make_iteration(shard_environment(mesh, setup, runs_on=method.runs_on), method, mesh)
     directory.mkdir(parents=True, exist_ok=True)
     console = Console()
-    if newest and (difference := another_machine(newest)):
+    if newest and (difference := another_machine(newest, config.devices)):
         console.print(difference, highlight=False, markup=False, soft_wrap=True)
     course = make_course(setup, env, directory, console, checkpoint.read_info(newest) if newest else None)
-    saved = newest
+    saved, stopped = newest, False
+
+    def course_after(step: Callable[[Position], Position]) -> Position:
+        """Where a step of the course leads from here; the course sees what is on this process's first device."""
+        seen = dataclasses.replace(now, state=local(mesh, now.state))
+        then = step(seen)
+        state = now.state if then.state is seen.state else spread(mesh, then.state)
+        return dataclasses.replace(then, state=state, assets=share(mesh, then.assets))
 
     def save() -> Path:
         # A row never spans a checkpoint: what is resumed has all of its rows in the file.
         log.write(now.iteration, now.environment_steps, setup.library.names, course.note)
         path = directory / "checkpoints" / f"{now.iteration:08d}"
         progress = Progress(now.iteration, now.environment_steps, base, course.curriculum)
-        checkpoint.save_checkpoint(path, setup, now.state, progress)
+        checkpoint.save_checkpoint(path, setup, gathered(now.state), progress)
         for old in checkpoints(directory)[:-KEEP]:
             shutil.rmtree(old)
         return path
@@ -77,9 +90,13 @@ def run(
             stop_requests() as stop,
             progress_bar(description, config.iterations, start=now.iteration, console=console) as report,
         ):
-            now = course.begin(now)
+            now = dataclasses.replace(now, state=spread(mesh, now.state))
+            now = course_after(course.begin)
             saved = saved or save()
-            while now.iteration < config.iterations and not course.finished and not stop:
+            while now.iteration < config.iterations and not course.finished:
+                stopped = anywhere(bool(stop))
+                if stopped:
+                    break
                 state, metrics = iterate(now.assets, now.state)
                 metrics = jax.device_get(metrics)
                 steps = now.environment_steps + config.ppo.num_envs * config.ppo.num_steps
@@ -88,7 +105,7 @@ def run(
                 if now.iteration == 1 or now.iteration % LOG_EVERY == 0:
                     log.write(now.iteration, steps, setup.library.names, course.note)
                 report(now.iteration, steps, _live(metrics))
-                now = course.after(now)
+                now = course_after(course.after)
                 if now.iteration % config.checkpoint_every == 0:
                     saved = save()  # after the evaluation, which a run that is resumed from here does not make again
             if int(saved.name) != now.iteration:
@@ -101,13 +118,15 @@ def run(
         elif isinstance(error, OSError) and error.filename is None:
             error.filename = str(directory)  # a full disk does not say where
         raise
-    if stop:
+    if stop or stopped:
         raise interrupted(config, directory, course.command)
-    return saved, now.state
+    return saved, local(mesh, now.state)
 
 
 def interrupted(config: Config, directory: Path, command: str) -> Interrupted:
     """What a stopped run says at its end: what it saved, and the command that continues it."""
+    if jax.process_index() > 0:
+        return Interrupted("stopped with the first process, which saved")
     again = command_line(command, robot=config.robot, resume=True, output=directory)
     return Interrupted(f"stopped; saved {newest_checkpoint(directory)}; continue with: {again}")
 

@@ -13,8 +13,10 @@ import jax.numpy as jnp
 import mujoco
 import mujoco.batch
 import numpy as np
+from jax.sharding import PartitionSpec as P
 
 from forgetmimic_jax.basics.provenance import cores
+from forgetmimic_jax.basics.shards import average
 from forgetmimic_jax.physics.choose import resolve_engine
 from forgetmimic_jax.ppo.collect import collect
 from forgetmimic_jax.ppo.rule import Rule
@@ -22,6 +24,7 @@ from forgetmimic_jax.ppo.update import make_iteration
 from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.tracking.action import to_joint_target
 from forgetmimic_jax.tracking.setup import Setup
+from forgetmimic_jax.training.devices import mesh_of, shard_environment, share, spread
 from forgetmimic_jax.training.start import start_state, template
 
 Figures = dict[str, float | int | str]
@@ -79,6 +82,48 @@ def speed(setup: Setup, *, repeats: int, started: float) -> Figures:
         "share_update": (median["iteration"] - median["collect"]) / median["iteration"],
         "seconds_to_first_iteration": to_first_iteration,
         "peak_memory_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / RSS_UNIT,
+    }
+
+
+def growth(setup: Setup, *, repeats: int) -> Figures:
+    """The time of an iteration on the devices of the config, and of what the devices exchange in one. Medians.
+
+    Args:
+        setup: robot, clips and settings; `devices.join` came before.
+        repeats: times each part is measured.
+    """
+    config, rule = setup.config, Rule()
+    mesh, ppo = mesh_of(config.devices), setup.config.ppo
+    env, assets = tracking.make_environment(setup, ppo.num_envs), tracking.make_assets(setup)
+    state = spread(mesh, start_state(setup, env, assets))
+    if mesh is None:
+        iteration = make_iteration(env, rule)
+    else:
+        iteration = make_iteration(shard_environment(mesh, setup), rule, mesh)
+    assets, steps = share(mesh, assets), ppo.epochs * ppo.minibatches
+
+    def exchange(gradient):
+        return jax.lax.scan(lambda mean, _: (average(mean), None), gradient, length=steps)[0]
+
+    one = exchange if mesh is None else jax.shard_map(exchange, mesh=mesh, in_specs=P(), out_specs=P(), check_vma=False)
+    averaging = jax.jit(one)
+    seconds: dict[str, list[float]] = {"iteration": [], "averaging": []}
+    for repeat in range(repeats + 1):
+        begin = time.perf_counter()
+        state, _ = jax.block_until_ready(iteration(assets, state))
+        took = {"iteration": time.perf_counter() - begin}
+        took["averaging"] = _timed(averaging, state.policy.parameters)
+        if repeat:  # the first time compiles
+            for name, values in seconds.items():
+                values.append(took[name])
+    return {
+        "engine": resolve_engine(config.physics.engine),
+        "devices": config.devices,
+        "cores": cores(),
+        "environments": ppo.num_envs,
+        "control_steps": ppo.num_envs * ppo.num_steps,
+        "iteration_seconds": statistics.median(seconds["iteration"]),
+        "averaging_seconds": statistics.median(seconds["averaging"]) if mesh else 0.0,
     }
 
 

@@ -15,6 +15,7 @@ from forgetmimic_jax.settings.config import UnlearnConfig, load_config
 from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.tracking.stand import STAND, stand_library
 from forgetmimic_jax.training.checkpoint import CONFIG, newest_checkpoint
+from forgetmimic_jax.training.devices import agreed
 from forgetmimic_jax.training.run import run
 
 SECONDS = 5.0  # of the stand
@@ -27,7 +28,7 @@ def stand_success(setup: Setup, policy: Policy | None) -> float:
     config = dataclasses.replace(setup.config, unlearn=UnlearnConfig())
     stand = dataclasses.replace(setup, config=config, library=_stand(setup), instead=None)
     rollout = Evaluator(stand, episodes=EPISODES, seed=setup.config.seed).rollout(policy)
-    return float((rollout.length == rollout.horizon).mean())
+    return agreed(float((rollout.length == rollout.horizon).mean()))
 
 
 def standing_teacher(setup: Setup, directory: Path) -> Policy:
@@ -50,7 +51,8 @@ def standing_teacher(setup: Setup, directory: Path) -> Policy:
     learning = _learning(setup)
     folder = directory.with_name(f"{directory.name}-{STAND}")
     resume = newest_checkpoint(folder) is not None
-    if resume and load_config(folder / CONFIG) != learning.config:
+    devices = learning.config.devices  # another number of them continues too
+    if resume and dataclasses.replace(load_config(folder / CONFIG), devices=devices) != learning.config:
         raise InputError(f"{folder}: is of a run with other settings; remove it, or choose another --output")
     try:
         _, state = run(learning, folder, description="learn to stand", resume=resume)

@@ -143,12 +143,16 @@ def saved_state(setup: Setup, env: Environment, assets: Assets, path: Path) -> t
     return state, info.environment_steps
 
 
-def another_machine(path: Path) -> str | None:
-    """What a run says that resumes from checkpoint `path` on another machine; None on the machine of before.
+def another_machine(path: Path, devices: int) -> str | None:
+    """What a run says that resumes from checkpoint `path` on another machine or number of devices; None otherwise.
 
-    Another processor, or another number of cores, adds floating-point numbers in another order.
+    Another processor, or another number of cores, adds floating-point numbers in another order. Every device draws
+    noise of its own.
     """
-    before, here = checkpoint.read_info(path).made, dataclasses.asdict(made_here())
+    info, here = checkpoint.read_info(path), dataclasses.asdict(made_here())
+    if info.config.devices != devices:
+        return f"{path} was made with --devices {info.config.devices}, this run has {devices}: its noise will differ"
+    before = info.made
     then, now = (f"{made.get('processor')} (cores: {made.get('cores')})" for made in (before, here))
     if not before or then == now:
         return None

@@ -25,6 +25,7 @@ from forgetmimic_jax.tracking.env import Environment
 from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.training.checkpoint import CheckpointInfo
 from forgetmimic_jax.training.course import Plain, Position
+from forgetmimic_jax.training.devices import agreed
 
 AT_BASELINE = 0.1  # skill up to which the targets are at the zero-action baseline
 IN_A_ROW = 2
@@ -98,7 +99,7 @@ class Stopping(Plain):
         position, settling = super().after(position), settles_from(self._skills) is not None
         if not settling and position.iteration % self._setup.config.unlearn.stop_every == 0:
             self._targets = self._targets or Targets(self._setup)
-            self._skills.append((position.iteration, self._targets.skill(position.state.policy)))
+            self._skills.append((position.iteration, agreed(self._targets.skill(position.state.policy))))
             if settles_from(self._skills) is not None:
                 self._console.print(
                     f"iteration {position.iteration}: the targets' skill is at the zero-action baseline "

@@ -66,6 +66,8 @@ class Options:
     """Evaluation episodes a clip."""
     physics: EngineName | None = None
     """Physics engine; auto is native on a CPU and mjx on a GPU or TPU."""
+    devices: int | None = None
+    """Devices that share the environments: GPUs, or on a CPU parts of its cores; 1 by default (docs/cluster.md)."""
     library: Path | None = None
     """Folder of clips; the base's by default."""
     output: Path | None = None
@@ -79,7 +81,8 @@ class Options:
 def config_of(options: Options, output: Path | None = None) -> Config:
     """Every setting of a run; with `resume`, those of the run in folder `output`."""
     config = _config_of_run(options, output) if options.resume and output else config_of_new_run(options)
-    config = override(replace_given(config, iterations=options.iterations), itertools.chain(*options.set))
+    config = replace_given(config, iterations=options.iterations, devices=options.devices)
+    config = override(config, itertools.chain(*options.set))
     return on_engine(config, options.physics)
 
 
@@ -92,7 +95,7 @@ def config_of_new_run(options: Options) -> Config:
 
     info = checkpoint.read_info(options.base or base_folder(options.robot))
     config = _on_preset(info.config, options.preset) if options.preset else info.config
-    config = dataclasses.replace(config, base=None, evaluate_every=0)
+    config = dataclasses.replace(config, base=None, evaluate_every=0, devices=1)
     base = info.path if options.base else None  # a run's folder stands for another policy once the run continues
     config = replace_given(config, robot=options.robot, seed=options.seed, library=options.library, base=base)
     targets = default_targets(config) if options.targets is None else comma_separated(options.targets)

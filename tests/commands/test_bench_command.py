@@ -5,6 +5,7 @@ import pytest
 from miniature import TINY, finished
 
 from forgetmimic_jax import bench
+from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.ppo import update
 from forgetmimic_jax.settings import config
 from forgetmimic_jax.settings.options import override
@@ -69,6 +70,12 @@ def test_an_unknown_commit_is_named(refused):
             {"against": "HEAD", "dry": True},
             "--dry: does not go with --against, which measures the default settings",
         ),
+        (
+            {"against": "HEAD", "devices": "2"},
+            "--devices: does not go with --against, which measures the default settings",
+        ),
+        ({"dry": True, "devices": "2"}, "--dry: does not go with --devices"),
+        ({"devices": "1,0"}, "--devices: found 1,0; accepted: numbers from 1 on, such as 1,2,4"),
         ({"robot": "gg1"}, "robot 'gg1': no robots/gg1/gg1.yaml; did you mean 'g1'?"),
         ({"library": Path("nowhere")}, "nowhere/manifest.json: not found; a library is a folder with manifest.json"),
         ({"output": Path(__file__) / "figures.json"}, f"{__file__}: {__file__} is a file; choose another --output"),
@@ -77,3 +84,37 @@ def test_an_unknown_commit_is_named(refused):
 )
 def test_what_cannot_be_is_told_in_one_line(refused, given, message):
     assert refused(bench.main, bench.Options(**given)) == message
+
+
+def test_the_growth_over_devices_is_measured_and_past_the_cores_computed(monkeypatch, tmp_path):
+    asked = []
+
+    def figures_of(root, output, options, more, use):
+        devices = int(more[more.index("--devices") + 1])
+        asked.append((devices, use))
+        if devices > 2:
+            raise InputError("its bench ended with exit code 2: error: --devices: found 4; accepted: 1 to 2")
+        seconds = {1: (8.0, 0.0), 2: (5.0, 0.5)}[devices]
+        names = ("iteration_seconds", "averaging_seconds")
+        return {"devices": devices, "cores": use, "control_steps": 100, **dict(zip(names, seconds, strict=True))}
+
+    monkeypatch.setattr(bench, "_figures_of", figures_of)
+    monkeypatch.setattr(bench, "cores", lambda: 3)
+    output = tmp_path / "growth.json"
+    printed = finished(bench.main, bench.Options(devices="4,1,2", output=output)).printed
+    rows = json.loads(output.read_text())["growth"]
+    assert asked == [(1, 1), (2, 2), (4, 3)]  # a core for each device, as many as there are
+    assert [row["measured"] for row in rows] == [True, True, False]
+    assert rows[2]["iteration_seconds"] == pytest.approx(8.0 / 4 + 0.5)
+    assert [row["over_first"] for row in rows] == pytest.approx([1.0, 8.0 / 5.0, 8.0 / 2.5])
+    assert "computed" in printed
+
+
+def test_the_first_number_of_devices_must_be_measured(monkeypatch, refused):
+    def figures_of(*_):
+        raise InputError("its bench ended: error: --devices: found 2; accepted: 1")
+
+    monkeypatch.setattr(bench, "_figures_of", figures_of)
+    assert (
+        refused(bench.main, bench.Options(devices="2,4")) == "its bench ended: error: --devices: found 2; accepted: 1"
+    )
