@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from forgetmimic_jax.basics.errors import InputError, run_command
 from forgetmimic_jax.settings.config import Config, EngineName, Preset, UnlearnConfig
@@ -23,10 +23,11 @@ from forgetmimic_jax.settings.options import (
 if TYPE_CHECKING:
     from forgetmimic_jax.tracking.setup import Setup
 
-# What differs from the preset: how long, and how often the curriculum looks, at enough episodes to judge by.
-LENGTH: dict[str, dict[str, Any]] = {
-    "cpu": {"iterations": 7_200, "evaluate_every": 100, "checkpoint_every": 50},
-    "paper": {"iterations": 30_000, "evaluate_every": 500, "checkpoint_every": 500},
+# What differs from the preset: how long, and how often the curriculum looks, at enough episodes to judge by. A base has
+# to survive pushes and wrong sensors, and its robot cannot reach through itself.
+DIFFERENCES: dict[str, tuple[str, ...]] = {
+    "cpu": ("iterations=7200", "evaluate_every=100", "noise.enabled=true", "physics.self_collision=true"),
+    "paper": ("iterations=30000", "evaluate_every=500"),
 }
 EPISODES = 20  # a clip in an evaluation
 
@@ -113,7 +114,8 @@ def config_of(options: Options, output: Path) -> Config:
         base = None if str(base) == "none" else base
         if base and without:
             raise InputError(f"--base: found {base} with --without; accepted: none, since a base may know those clips")
-        config = dataclasses.replace(preset(options.preset), **LENGTH[options.preset], evaluate_episodes=EPISODES)
+        config = override(preset(options.preset), DIFFERENCES[options.preset])
+        config = dataclasses.replace(config, evaluate_episodes=EPISODES)
         config = replace_given(config, robot=options.robot, seed=options.seed, library=options.library, base=base)
         config = with_interface_of_base(config)
         if without:

@@ -25,6 +25,8 @@ def test_a_base_from_nothing_in_at_most_120_million_steps():
     assert (config.base, config.library, config.robot) == (None, None, "g1")
     assert config.iterations * config.ppo.num_envs * config.ppo.num_steps == 88_473_600
     assert (config.evaluate_every, config.checkpoint_every, config.evaluate_episodes) == (100, 50, 20)
+    assert config.noise.enabled
+    assert config.physics.self_collision
     assert config.ppo == preset("cpu").ppo
 
 
