@@ -20,7 +20,6 @@ from forgetmimic_jax.studies.penalty import penalty_study
 from forgetmimic_jax.studies.samplers import sampler_study
 from forgetmimic_jax.studies.study import Document, Study, variants_study
 from forgetmimic_jax.studies.targets import targets_study
-from forgetmimic_jax.training.start import base_folder
 
 
 @dataclass(kw_only=True)
@@ -68,6 +67,8 @@ STUDIES: dict[str, Callable[..., Study]] = {
 
 def main(options: Options) -> None:
     """Run the sweep."""
+    from forgetmimic_jax.training.start import base_folder
+
     if not options.draw:
         options.bases = options.bases or str(base_folder(options.robot))
     options.output = options.output or Path("runs") / f"sweep-{options.robot}-{options.kind}"
