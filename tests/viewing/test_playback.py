@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from forgetmimic_jax.evaluation.side_by_side import SideBySide
+from forgetmimic_jax.motion.library import only_clips
 from forgetmimic_jax.viewing.playback import Playback
 from forgetmimic_jax.viewing.takes import record
 
@@ -20,10 +21,7 @@ def playback(stage, robot) -> Playback:
 
 def test_it_shows_the_episode_that_a_film_of_the_same_start_shows(playback, library, tiny_setup, policy):
     # Alone in its library, a clip's noise is drawn for one start, as the playback's is.
-    import jax
-
-    alone = jax.tree.map(lambda values: values[1:], library).replace(names=library.names[1:])
-    setup = dataclasses.replace(tiny_setup, library=alone)
+    setup = dataclasses.replace(tiny_setup, library=only_clips(library, ["turn"]))
     (episode,) = record(setup, {"zero_action": None, "random": policy}, ["turn"], ["turn"], seed=3)
     while not playback.done:
         playback.advance()
