@@ -119,10 +119,12 @@ def mesh_of(devices: int) -> Mesh | None:
     return Mesh(np.asarray(jax.devices()[:devices]), (AXIS,)) if devices > 1 else None
 
 
-def shard_environment(mesh: Mesh, setup: Setup, *, runs_on: float = 0.0) -> Environment:
-    """The environment of one shard of the mesh."""
-    robots = setup.config.ppo.num_envs // mesh.size
-    return make_environment(setup, robots, runs_on=runs_on, shards=len(mesh.local_devices))
+def shard_environment(mesh: Mesh | None, setup: Setup, env: Environment) -> Environment:
+    """The environment of one shard of the mesh, of all whose robots `env` is; without a mesh that is `env` itself."""
+    if mesh is None:
+        return env
+    runs_on, shards = env.runs_on * env.control_step, len(mesh.local_devices)
+    return make_environment(setup, env.num_envs // mesh.size, noisy=env.noisy, runs_on=runs_on, shards=shards)
 
 
 def spread(mesh: Mesh | None, state: TrainState) -> TrainState:

@@ -55,10 +55,7 @@ def run(
         state, environment_steps = saved_state(setup, env, assets, newest)
         now = Position(state, assets, int(state.iteration), environment_steps)
     mesh = mesh_of(config.devices)
-    if mesh is None:
-        iterate = make_iteration(env, method)
-    else:
-        iterate = make_iteration(shard_environment(mesh, setup, runs_on=method.runs_on), method, mesh)
+    iterate = make_iteration(shard_environment(mesh, setup, env), method, mesh)
     directory.mkdir(parents=True, exist_ok=True)
     console = Console()
     if newest and (difference := another_machine(newest, config.devices)):

@@ -96,10 +96,7 @@ def growth(setup: Setup, *, repeats: int) -> Figures:
     mesh, ppo = mesh_of(config.devices), setup.config.ppo
     env, assets = tracking.make_environment(setup, ppo.num_envs), tracking.make_assets(setup)
     state = spread(mesh, start_state(setup, env, assets))
-    if mesh is None:
-        iteration = make_iteration(env, rule)
-    else:
-        iteration = make_iteration(shard_environment(mesh, setup), rule, mesh)
+    iteration = make_iteration(shard_environment(mesh, setup, env), rule, mesh)
     assets, steps = share(mesh, assets), ppo.epochs * ppo.minibatches
 
     def exchange(gradient):

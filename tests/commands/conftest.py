@@ -19,9 +19,9 @@ def compiled_once() -> Iterator[None]:
     """Runs of the same settings share one compiled iteration; it depends on none of the settings left out here."""
     make, compiled = run.make_iteration, {}
 
-    def shared(env, rule):
+    def shared(env, rule, mesh=None):
         key = config_hash(dataclasses.replace(env.config, seed=0))
-        return compiled.setdefault(key, make(env, rule))
+        return compiled.setdefault(key, make(env, rule, mesh))
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run, "make_iteration", shared)

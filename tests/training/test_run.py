@@ -61,7 +61,7 @@ def run(setup, tmp_path, monkeypatch):
         return dataclasses.replace(state, iteration=jnp.int32(iteration)), metrics
 
     monkeypatch.setattr(run_module, "start_state", nothing)
-    monkeypatch.setattr(run_module, "make_iteration", lambda _env, _rule: iterate)
+    monkeypatch.setattr(run_module, "make_iteration", lambda _env, _rule, _mesh: iterate)
 
     def run(*, resume: bool = False, **settings):
         config = dataclasses.replace(setup.config, **settings)
