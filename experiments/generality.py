@@ -46,8 +46,8 @@ class HeldOutOptions(Options):
 
 def libraries(lab: Lab) -> dict[str, Path]:
     """The libraries that were named, by the name of their folder."""
-    named = getattr(lab.options, "held_out", None) or ""
-    return {Path(folder).name: Path(folder) for folder in comma_separated(named)}
+    assert isinstance(lab.options, HeldOutOptions)
+    return {Path(folder).name: Path(folder) for folder in comma_separated(lab.options.held_out or "")}
 
 
 def conditions(lab: Lab) -> dict[str, Any]:
