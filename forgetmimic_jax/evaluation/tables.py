@@ -298,7 +298,8 @@ def notes(document: EvaluationDocument) -> list[str]:
     if unbounded_in_brief(document):
         lines.append(
             f"targets without terminations: each target is played to its end and {HOLD_SECONDS:g} s longer with its "
-            f"last frame held, whatever the robot does. Its bodies also collide with each other, unlike in training."
+            "last frame held, whatever the robot does. Its bodies collide with each other, even where training leaves "
+            "that out."
         )
         lines.append("upright: no fall until then. motion content: 1 is the whole clip, 0 what a standing robot shows.")
     for name, policy in document.policies.items():
