@@ -12,6 +12,7 @@ from pathlib import Path
 
 from experiments import (
     comparison,
+    from_scratch,
     generality,
     heat_map,
     membership,
@@ -49,6 +50,7 @@ STUDIES: Mapping[str, Study] = {
     "g1/membership": membership.STUDY,
     "g1/overlap": overlap.STUDY,
     "g1/generality": generality.STUDY,
+    "g1/from_scratch": from_scratch.STUDY,
 }
 
 

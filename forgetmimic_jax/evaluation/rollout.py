@@ -17,6 +17,7 @@ from jax import Array
 from forgetmimic_jax.basics import rotation
 from forgetmimic_jax.evaluation.metrics import Rollout
 from forgetmimic_jax.physics.engine import CONTACT_FORCE
+from forgetmimic_jax.ppo.rule import Rule
 from forgetmimic_jax.robot.model import Robot
 from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking import env as tracking
@@ -39,12 +40,15 @@ class Acting(Protocol):
 class Evaluator:
     """Rolls policies out on the same episodes of one library. Compiled once, used for any number of policies."""
 
-    def __init__(self, setup: Setup, *, episodes: int, seed: int, noise: bool = False):
-        setup = evaluation_setup(setup)
+    def __init__(self, setup: Setup, *, episodes: int, seed: int, noise: bool = False, rule: Rule | None = None):
+        """With a rule, what the targets' episodes are asked for and what ends them is as in training under it."""
+        setup, rule = evaluation_setup(setup), rule or Rule()
         self.config = setup.config
         self.clip, self.start_frame = episode_starts(np.asarray(setup.library.length), episodes, seed)
         self._seed = seed
-        self._env = tracking.make_environment(setup, len(self.clip), noisy=noise)
+        self._env = tracking.make_environment(
+            setup, len(self.clip), noisy=noise, runs_on=rule.runs_on, asked=rule.asked
+        )
         self._assets = tracking.make_assets(setup)
         self._begin = jax.jit(self._begin_episodes)
         self._advance = jax.jit(self._advance_chunk)

@@ -15,7 +15,7 @@ import mujoco
 from flax import struct
 from jax import Array
 
-from forgetmimic_jax.motion.library import MotionLibrary
+from forgetmimic_jax.motion.library import Frames, MotionLibrary
 from forgetmimic_jax.physics import BodyState, Engine, PhysicsParameters, PhysicsState
 from forgetmimic_jax.physics.choose import make_engine
 from forgetmimic_jax.policy.policy import Policy
@@ -25,7 +25,7 @@ from forgetmimic_jax.tracking import observation, randomise, reward
 from forgetmimic_jax.tracking.action import in_robot_order, to_joint_target
 from forgetmimic_jax.tracking.focus import Focus, focus_of
 from forgetmimic_jax.tracking.layouts import Layout, Moment, find_layout
-from forgetmimic_jax.tracking.reference import align_to_anchor, anchor_between, lookup
+from forgetmimic_jax.tracking.reference import align_to_anchor, anchor_between, at_anchor, lookup
 from forgetmimic_jax.tracking.reward import Pair
 from forgetmimic_jax.tracking.rsi import Bins, bin_probabilities, make_bins, sample_start
 from forgetmimic_jax.tracking.setup import Setup
@@ -90,6 +90,7 @@ class Environment:
     num_envs: int
     noisy: bool  # reset noise, pushes, randomisation and observation noise
     runs_on: int = 0  # control steps that a target's episode lasts after the clip's end; with any, only a fall ends it
+    asked: bool = False  # whether a robot at a target clip is asked for what it shall do instead
 
     @property
     def layout(self) -> Layout:
@@ -106,7 +107,13 @@ class Environment:
 
 
 def make_environment(
-    setup: Setup, num_envs: int, *, noisy: bool | None = None, runs_on: float = 0.0, shards: int = 1
+    setup: Setup,
+    num_envs: int,
+    *,
+    noisy: bool | None = None,
+    runs_on: float = 0.0,
+    asked: bool = False,
+    shards: int = 1,
 ) -> Environment:
     """An environment of `num_envs` robots.
 
@@ -116,6 +123,7 @@ def make_environment(
         noisy: by default the config's.
         runs_on: s that an episode of a target clip lasts after the clip's end, with the last frame held. Above 0, such
             an episode is terminated by a fall only.
+        asked: whether the reference of a target clip is what to do instead of it, at the place of the robot.
         shards: of this process, each with `num_envs` robots, that step at the same time.
     """
     config, robot = setup.config, setup.robot
@@ -123,7 +131,7 @@ def make_environment(
     physics = dataclasses.replace(config.physics, substeps=1) if assisted else config.physics  # see `_simulate`
     engine = make_engine(robot, physics, num_envs, shards)
     noisy = config.noise.enabled if noisy is None else noisy
-    return Environment(config, robot, engine, num_envs, noisy, round(runs_on / config.physics.control_step))
+    return Environment(config, robot, engine, num_envs, noisy, round(runs_on / config.physics.control_step), asked)
 
 
 def make_assets(setup: Setup) -> Assets:
@@ -176,6 +184,24 @@ def start_episodes(
     )
 
 
+def to_follow(env: Environment, assets: Assets, state: EnvState, ahead: int) -> Frames:
+    """The frame [env] that the robots are asked for, `ahead` frames from now."""
+    clip = lookup(assets.library, state.clip, state.frame + ahead)
+    return _where(assets.is_target[state.clip], instead_of_clip(env, assets, state, ahead), clip) if env.asked else clip
+
+
+def instead_of_clip(env: Environment, assets: Assets, state: EnvState, ahead: int) -> Frames:
+    """The frame [env] of what to do instead of a target, `ahead` frames from now, at the robot's place and heading.
+
+    It is at the frame of the clip to forget, whose last frame it does not pass: nothing tells a policy more.
+    """
+    assert assets.instead is not None
+    frame = jnp.minimum(state.frame + ahead, assets.library.length[state.clip] - 1)
+    anchor, bodies = env.robot.anchor, state.bodies
+    reference = lookup(assets.instead, jnp.zeros_like(frame), frame)
+    return at_anchor(reference, anchor, bodies.pos[:, anchor], bodies.quat[:, anchor])
+
+
 def refresh_bodies(env: Environment, state: EnvState, mask: Array) -> EnvState:
     """Key bodies by forward kinematics where mask [env]: a reset's noise moved them off the reference."""
     bodies = env.engine.forward(state.physics, state.parameters, mask, state.bodies)
@@ -213,7 +239,7 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
         key: for pushes.
     """
     config, robot = env.config, env.robot
-    reference = lookup(assets.library, state.clip, state.frame + 1)
+    reference = to_follow(env, assets, state, ahead=1)
     action = in_robot_order(robot, action)
     # The joint controller regulates what its encoders read, so their bias moves the robot, not the reading.
     joint_target = to_joint_target(config.action.mode, assets.robot, reference, action) - state.encoder_bias
@@ -233,6 +259,7 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
     physics, bodies = (_where(diverged, old, new) for old, new in ((state.physics, physics), (state.bodies, bodies)))
 
     joint_pos, joint_vel = physics.qpos[:, 7:], physics.qvel[:, 6:]
+    reference = to_follow(env, assets, dataclasses.replace(state, bodies=bodies), ahead=1)
     aligned = align_to_anchor(reference, robot.anchor, bodies.pos[:, robot.anchor], bodies.quat[:, robot.anchor])
     pair = Pair(reference, aligned, bodies, joint_pos, joint_vel, robot.anchor)
     kernels = reward.tracking_kernels(pair)
@@ -299,7 +326,7 @@ def moment_of(env: Environment, assets: Assets, state: EnvState) -> Moment:
     """What the observations of the running episodes are made of."""
     return Moment(
         robot=assets.robot,
-        reference=lookup(assets.library, state.clip, state.frame + 1),
+        reference=to_follow(env, assets, state, ahead=1),
         physics=state.physics,
         bodies=state.bodies,
         last_action=state.last_action,

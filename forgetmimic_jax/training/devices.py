@@ -124,7 +124,9 @@ def shard_environment(mesh: Mesh | None, setup: Setup, env: Environment) -> Envi
     if mesh is None:
         return env
     runs_on, shards = env.runs_on * env.control_step, len(mesh.local_devices)
-    return make_environment(setup, env.num_envs // mesh.size, noisy=env.noisy, runs_on=runs_on, shards=shards)
+    return make_environment(
+        setup, env.num_envs // mesh.size, noisy=env.noisy, runs_on=runs_on, asked=env.asked, shards=shards
+    )
 
 
 def spread(mesh: Mesh | None, state: TrainState) -> TrainState:

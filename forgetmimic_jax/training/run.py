@@ -15,6 +15,7 @@ from forgetmimic_jax.basics.console import command_line
 from forgetmimic_jax.basics.console import progress as progress_bar
 from forgetmimic_jax.basics.errors import Interrupted
 from forgetmimic_jax.basics.signals import stop_requests
+from forgetmimic_jax.ppo.rule import Rule
 from forgetmimic_jax.ppo.state import TrainState
 from forgetmimic_jax.ppo.update import make_iteration
 from forgetmimic_jax.settings.config import Config, save_config
@@ -34,9 +35,17 @@ LOG_EVERY = 10  # iterations averaged into one row of metrics.jsonl; the first h
 
 
 def run(
-    setup: Setup, directory: Path, *, description: str, resume: bool = False, make_course: MakeCourse = Plain
+    setup: Setup,
+    directory: Path,
+    *,
+    description: str,
+    resume: bool = False,
+    make_course: MakeCourse = Plain,
+    rule: Rule | None = None,
 ) -> tuple[Path, TrainState]:
     """Train until `config.iterations`, or until the course is finished; returns the last checkpoint and the state.
+
+    The rule is the method's, unless another is given.
 
     The folder gets config.yaml, metrics.jsonl (means over LOG_EVERY iterations), TensorBoard events and checkpoints/,
     the first of them before the first iteration, so that a run that is killed can always continue. With
@@ -47,15 +56,15 @@ def run(
     config = setup.config
     base = unlearned_base(config)
     newest = prepare_folder(directory, resume=resume)
-    method = method_of(config)
-    env, assets = make_environment(setup, config.ppo.num_envs, runs_on=method.runs_on), make_assets(setup)
+    rule, assets = rule or method_of(config), make_assets(setup)
+    env = make_environment(setup, config.ppo.num_envs, runs_on=rule.runs_on, asked=rule.asked)
     if newest is None:
         now = Position(start_state(setup, env, assets), assets, 0, steps_before(config))
     else:
         state, environment_steps = saved_state(setup, env, assets, newest)
         now = Position(state, assets, int(state.iteration), environment_steps)
     mesh = mesh_of(config.devices)
-    iterate = make_iteration(shard_environment(mesh, setup, env), method, mesh)
+    iterate = make_iteration(shard_environment(mesh, setup, env), rule, mesh)
     directory.mkdir(parents=True, exist_ok=True)
     console = Console()
     if newest and (difference := another_machine(newest, config.devices)):

@@ -1,11 +1,12 @@
-"""Stand instead: on a target clip the policy does what the base does where its reference is a stand.
+"""Stand instead: on a target clip the policy does what its teacher does where the reference is a stand.
 
 Ours; near to it are DAgger (Ross et al. 2011, "A Reduction of Imitation Learning and Structured Prediction to No-Regret
-Online Learning") and policy distillation (Rusu et al. 2016). The base itself is the teacher: its observation has the
-stand reference in the place of the clip's, all that is measured on the robot stays, and the last action is that of the
-same joint targets against the stand reference. On target steps KL(π ‖ N(teacher's action, σ_base)), on kept steps
-KL(π ‖ π_base). No reward is used. The states are those that the policy visits: only a fall terminates an episode of a
-target clip, which runs on after the clip's end. `unlearn.instead` may also name a kept clip.
+Online Learning") and policy distillation (Rusu et al. 2016). The teacher is the base, after training on standing where
+it needs that (training/standing.py). Its observation has the stand reference in the place of the clip's, all that is
+measured on the robot stays, and the last action is that of the same joint targets against the stand reference. On
+target steps KL(π ‖ N(teacher's action, σ_base)), on kept steps KL(π ‖ π_base). No reward is used. The states are those
+that the policy visits: only a fall terminates an episode of a target clip, which runs on after the clip's end.
+`unlearn.instead` may also name a kept clip.
 """
 
 from __future__ import annotations
@@ -15,15 +16,14 @@ import dataclasses
 import jax.numpy as jnp
 from jax import Array
 
-from forgetmimic_jax.motion.library import Frames
 from forgetmimic_jax.policy.gaussian import entropy, kl_divergence
 from forgetmimic_jax.ppo.loss import Batch, Prediction, mean
 from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking.action import in_robot_order, to_action, to_joint_target
-from forgetmimic_jax.tracking.env import Assets, Environment, EnvState, moment_of
+from forgetmimic_jax.tracking.env import Assets, Environment, EnvState, instead_of_clip, moment_of
 from forgetmimic_jax.tracking.layouts import Moment
 from forgetmimic_jax.tracking.observation import actor_observation, in_policy_order
-from forgetmimic_jax.tracking.reference import at_anchor, lookup
+from forgetmimic_jax.tracking.reference import lookup
 from forgetmimic_jax.tracking.stand import STAND
 from forgetmimic_jax.unlearning.method import SHORT, Method, Pace
 
@@ -34,10 +34,10 @@ def teacher_moment(env: Environment, assets: Assets, episodes: EnvState) -> Mome
     sent = to_joint_target(
         mode, assets.robot, lookup(assets.library, episodes.clip, episodes.frame), episodes.last_action
     )
-    last_action = to_action(mode, assets.robot, _instead(env, assets, episodes, ahead=0), sent)
+    last_action = to_action(mode, assets.robot, instead_of_clip(env, assets, episodes, ahead=0), sent)
     return dataclasses.replace(
         moment,
-        reference=_instead(env, assets, episodes, ahead=1),
+        reference=instead_of_clip(env, assets, episodes, ahead=1),
         last_action=jnp.where(episodes.step[:, None] == 0, 0.0, last_action),
     )
 
@@ -50,19 +50,6 @@ def taught_action(env: Environment, assets: Assets, episodes: EnvState) -> Array
     joint_target = to_joint_target(mode, assets.robot, moment.reference, in_robot_order(robot, action))
     reference = lookup(assets.library, episodes.clip, episodes.frame + 1)
     return in_policy_order(to_action(mode, assets.robot, reference, joint_target), robot.policy_joints)
-
-
-def _instead(env: Environment, assets: Assets, episodes: EnvState, ahead: int) -> Frames:
-    """The frame to follow instead, `ahead` frames from now, at the place and heading of the robot.
-
-    The clip to follow is at the frame of the clip to forget, whose last frame it does not pass: nothing tells a policy
-    more.
-    """
-    assert assets.instead is not None
-    frame = jnp.minimum(episodes.frame + ahead, assets.library.length[episodes.clip] - 1)
-    anchor, bodies = env.robot.anchor, episodes.bodies
-    reference = lookup(assets.instead, jnp.zeros_like(frame), frame)
-    return at_anchor(reference, anchor, bodies.pos[:, anchor], bodies.quat[:, anchor])
 
 
 def regression(config: Config, batch: Batch, now: Prediction, iteration: Array) -> tuple[Array, dict[str, Array]]:
@@ -86,7 +73,7 @@ METHOD = Method(
     loss=regression,
     teach=taught_action,
     runs_on=1.0,
-    settings={"keep": 4.0, "stand_iterations": 200.0},
+    settings={"keep": 4.0, "stand_iterations": 80.0},
     pace=PACE,
     instead=STAND,
 )

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from experiments import heat_map, membership, overlap, physical_behaviour, relearning, training_dynamics
+from experiments import from_scratch, heat_map, membership, overlap, physical_behaviour, relearning, training_dynamics
 from forgetmimic_jax import unlearn
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.evaluation.metrics import Rollout
@@ -281,6 +281,46 @@ def test_the_heat_map_has_the_base_first_and_then_every_evaluation_of_each_seed(
     assert [at["target"][TRACKING]["mean"] for at in found["groups"]] == pytest.approx([0.85, 0.4, 0.4])
     assert [at["kept"]["tracking_reward"]["mean"] for at in found["groups"]] == pytest.approx([0.8, 0.7, 0.7])
     assert lab.wanted == [{("λ = 16", of): {"set": ["evaluate_every=2", "evaluate_episodes=2"]} for of in lab.repeats}]
+
+
+def test_trainings_from_scratch_are_on_all_clips_and_compared_over_all_evaluations(tmp_path):
+    """By hand, tracking of the two clips: adaptive 0.5 and 0.7, uniform 0.2 and 0.6; so 0.2 more in the mean."""
+    lab = StandIn(tmp_path, iterations=16)
+    tracking = {
+        from_scratch.ADAPTIVE: [(0.4, 0.6), (0.6, 0.8)],
+        from_scratch.WITH_WRENCH: [(0.4, 0.6), (0.6, 0.8)],
+        from_scratch.UNIFORM: [(0.1, 0.3), (0.5, 0.7)],
+    }
+    for label, evaluations in tracking.items():
+        clips = [{TARGET: one, KEPT: other} for one, other in evaluations]
+        rows = [
+            {
+                "environment_steps": 100 * (place + 1),
+                "clips": {c: {TRACKING: v, "success_rate": v / 2} for c, v in at.items()},
+            }
+            for place, at in enumerate(clips)
+        ]
+        for seed in range(2):
+            write_rows(tmp_path / f"{label}-{seed}" / "evaluations.jsonl", rows)
+    found = from_scratch.measure(lab)
+    (wanted,) = lab.wanted
+    assert set(wanted) == {(label, repeat) for label in tracking for repeat in lab.repeats}
+    assert wanted[from_scratch.UNIFORM, Repeat(0, 0)] == {
+        **{"method": "retrain", "clips": "all", "sampler": "uniform_bins"},
+        "set": ["evaluate_every=2", "evaluate_episodes=2"],
+    }
+    assert found["environment_steps"] == [100, 200]
+    document = {"results": found}
+    more = from_scratch.gained(document, from_scratch.ADAPTIVE, from_scratch.UNIFORM, TRACKING)
+    assert more == {FIRST: pytest.approx(0.2), SECOND: pytest.approx(0.2)}
+    words = [(of.claim, of.evidence, of.word) for of in from_scratch.findings(document)]
+    assert words[0][0] == "The wrench helps a training from scratch"
+    assert words[0][1].startswith("tracking with it minus without 0.00")
+    assert words[1][1:] == (
+        "tracking with it minus without 0.200 [0.200, 0.200], success 10 % [10, 10]; bound 0",
+        "holds",
+    )
+    assert "| uniform RSI | 2 | 10 % [10, 10]" in from_scratch.body(document)
 
 
 def test_overlap_forgets_half_a_clip_and_keeps_the_other_on_a_library_of_its_own(tmp_path, library_folder, robot):

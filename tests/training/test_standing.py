@@ -7,19 +7,20 @@ import pytest
 
 from forgetmimic_jax.evaluation.metrics import Rollout
 from forgetmimic_jax.motion.library import only_clips
-from forgetmimic_jax.tracking.stand import stand_frame
 from forgetmimic_jax.training import standing
-from forgetmimic_jax.training.standing import stand_success, standing_teacher
+from forgetmimic_jax.training.standing import standing_teacher, upright_when_asked
+
+LENGTH = np.array([*[250] * 19, 249])  # of twenty episodes, one of which ends a step early
 
 
 @pytest.fixture
 def evaluated(monkeypatch) -> dict:
-    """The setup that is evaluated; `length` steps of 250 are completed in each of four episodes."""
-    seen = {"length": np.array([250, 250, 250, 249])}
+    """The setup that is evaluated, and how long each episode of 250 steps is."""
+    seen = {"length": LENGTH}
 
     class Evaluator:
-        def __init__(self, setup, *, episodes, seed):
-            seen.update(setup=setup, episodes=episodes)
+        def __init__(self, setup, *, episodes, seed, rule):
+            seen.update(setup=setup, episodes=episodes, rule=rule)
 
         def rollout(self, policy) -> Rollout:
             length = seen["length"]
@@ -29,46 +30,42 @@ def evaluated(monkeypatch) -> dict:
     return seen
 
 
-def test_a_base_is_measured_on_a_stand_of_five_seconds(tiny_setup, robot, evaluated):
-    assert stand_success(tiny_setup, None) == 0.75
-    library = evaluated["setup"].library
-    assert (library.names, int(library.length[0]), evaluated["episodes"]) == (("stand",), 251, 20)
-    np.testing.assert_array_equal(library.clip(0).joint_pos[250], stand_frame(robot).joint_pos)
+@pytest.fixture
+def setup(tiny_setup):
+    """`turn` is to be forgotten."""
+    unlearn = dataclasses.replace(tiny_setup.config.unlearn, targets=("turn",), settings={"stand_iterations": 7.0})
+    config = dataclasses.replace(tiny_setup.config, unlearn=unlearn)
+    return dataclasses.replace(tiny_setup, config=config, base=object())
 
 
-def test_a_base_that_stands_is_the_teacher(tiny_setup, evaluated, tmp_path, capsys):
-    base = object()
-    assert standing_teacher(dataclasses.replace(tiny_setup, base=base), tmp_path / "run") is base
+def test_a_base_is_asked_to_stand_in_the_targets_states(setup, evaluated):
+    assert upright_when_asked(setup, None) == 0.95
+    assert (evaluated["setup"].library.names, evaluated["episodes"]) == (("turn",), 20)
+    assert (evaluated["rule"].asked, evaluated["rule"].runs_on) == (True, 3.0)
+
+
+def test_a_base_that_stays_upright_is_the_teacher(setup, evaluated, tmp_path, capsys):
+    assert standing_teacher(setup, tmp_path / "run") is setup.base
     assert not list(tmp_path.iterdir())
-    assert capsys.readouterr().out == "the base completes 75% of 20 episodes of the stand\n"
+    said = "asked to stand in the middle of a target, the base stays upright in 95% of the episodes\n"
+    assert capsys.readouterr().out == said
 
 
-def test_a_base_that_stands_less_often_learns_it_on_all_clips_and_the_stand(
-    tiny_setup, evaluated, tmp_path, monkeypatch, library, robot
-):
-    evaluated["length"] = np.array([250, 250, 250, 250, 250, 250, 249, 3, 2])
-    config = dataclasses.replace(
-        tiny_setup.config,
-        unlearn=dataclasses.replace(tiny_setup.config.unlearn, targets=("turn",), settings={"stand_iterations": 7.0}),
-    )
+def test_a_base_that_falls_more_often_learns_it_from_the_targets_states(setup, evaluated, tmp_path, monkeypatch):
+    evaluated["length"] = np.array([*LENGTH[1:], 3])
     started = {}
 
-    def run(setup, folder, *, description, resume):
-        started.update(setup=setup, folder=folder, resume=resume)
+    def run(setup, folder, *, description, resume, rule):
+        started.update(setup=setup, folder=folder, resume=resume, rule=rule)
         return folder, type("State", (), {"policy": "taught"})
 
     monkeypatch.setattr(standing, "run", run)
-    setup = dataclasses.replace(tiny_setup, config=config, base=object())
     assert standing_teacher(setup, tmp_path / "run") == "taught"
-    assert (started["folder"], started["resume"]) == (tmp_path / "run-stand", False)
-    learning = started["setup"]
-    assert (learning.config.iterations, learning.config.sampling.target_share) == (7, 0.5)
-    assert (learning.config.unlearn.targets, learning.config.unlearn.method) == (("stand",), "finetune")
-    assert learning.library.names == ("sway", "turn", "stand")
-    np.testing.assert_array_equal(learning.library.length, [80, 41, 251])
-    for clip in range(2):
-        np.testing.assert_array_equal(learning.library.clip(clip).joint_pos, library.clip(clip).joint_pos)
-    np.testing.assert_array_equal(learning.library.clip(2).joint_pos[250], stand_frame(robot).joint_pos)
+    assert (started["folder"], started["resume"], started["rule"].asked) == (tmp_path / "run-stand", False, True)
+    config = started["setup"].config
+    assert (config.iterations, config.sampling.target_share, config.ppo.base_kl) == (7, 1.0, 0.0)
+    assert config.unlearn == setup.config.unlearn
+    assert started["setup"].library is setup.library
 
 
 def test_a_library_of_only_some_clips_has_their_frames_alone(library):
