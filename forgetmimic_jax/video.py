@@ -9,37 +9,26 @@ from typing import TYPE_CHECKING
 
 from forgetmimic_jax.basics.errors import InputError, nearest, run_command
 from forgetmimic_jax.settings.options import at_least, comma_separated, parse
+from forgetmimic_jax.viewing.options import Shown
 
 if TYPE_CHECKING:
     from forgetmimic_jax.viewing.takes import Episode
 
 
-@dataclass
-class Options:
+@dataclass(kw_only=True)
+class Options(Shown):
     """Film one episode of each clip, base beside unlearned policy, and put stills of all clips on one page.
 
     The episodes start at the clips' first frames. No termination ends them, and a target is played 3 s longer with its
     last frame held. Else the protocol is the evaluation's, on MuJoCo's C engine.
     """
 
-    robot: str = "g1"
-    """Robot under robots/."""
-    checkpoint: Path | None = None
-    """Checkpoint, or the folder of a run, such as an unlearning run's; the shipped base data/ROBOT/base by default."""
-    base: Path | None = None
-    """For an unlearned checkpoint, the base beside it; the one it started from by default."""
-    beside: str | None = None
-    """More checkpoints to film beside these, comma-separated; each is named by its method."""
     clips: str | None = None
     """Clips to film, comma-separated; all of the library by default."""
     seconds: float = 10.0
     """Longest film, s; a film ends sooner where the clip does, or 3 s later if it is to be forgotten."""
     stills: int = 6
     """Pictures of each clip on the page of stills, from its start to its end."""
-    seed: int = 0
-    """Seed of the reset noise; the same for every policy."""
-    library: Path | None = None
-    """Folder of clips; the checkpoint's by default."""
     output: Path | None = None
     """Folder for the films; videos/ in the checkpoint's run, or runs/video-ROBOT."""
 
@@ -50,29 +39,18 @@ def main(options: Options) -> None:
 
     from forgetmimic_jax.basics.console import closing, command_line, progress
     from forgetmimic_jax.basics.files import write_atomically
-    from forgetmimic_jax.training.comparison import load_comparison
     from forgetmimic_jax.training.folder import check_writable, folder_of
-    from forgetmimic_jax.training.start import base_folder
     from forgetmimic_jax.viewing import film
     from forgetmimic_jax.viewing.offscreen import check_rendering
     from forgetmimic_jax.viewing.takes import record
 
     at_least(1, "--stills", options.stills)
-    at_least(0, "--seed", options.seed)
     if not options.seconds > 0:
         raise InputError(f"--seconds: found {options.seconds:g}; accepted: above 0")
-    path = options.checkpoint or base_folder(options.robot)
-    run = folder_of(path)
+    run = folder_of(options.checkpoint) if options.checkpoint else None
     output = options.output or (run / "videos" if run else Path("runs") / f"video-{options.robot}")
     check_writable(output)
-    compared = load_comparison(
-        path,
-        robot=options.robot,
-        base=options.base,
-        beside=[Path(one) for one in comma_separated(options.beside or "")],
-        library=options.library,
-        physics="native",
-    )
+    compared = options.load()
     setup = compared.setup
     clips = setup.library.names if options.clips is None else comma_separated(options.clips)
     if not clips:
