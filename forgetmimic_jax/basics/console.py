@@ -23,6 +23,7 @@ def progress(
     total_iterations: int,
     *,
     start: int = 0,
+    at_most: bool = False,
     every_seconds: float = 30.0,
     console: Console | None = None,
 ) -> Iterator[Report]:
@@ -32,6 +33,7 @@ def progress(
         description: what is being done.
         total_iterations: where it ends.
         start: iterations already done, on a resume.
+        at_most: whether it may end sooner.
         every_seconds: between two plain lines.
         console: where to write; the standard output by default.
 
@@ -50,10 +52,10 @@ def progress(
     )
 
     console = console or Console()
-    clock = _Clock()
+    clock, bound = _Clock(), "at most " if at_most else ""
     if console.is_terminal:
         columns = (TextColumn("{task.description}"), BarColumn(bar_width=20), MofNCompleteColumn())
-        times = (TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(compact=True))
+        times = (TimeElapsedColumn(), TextColumn(f"{bound}left"), TimeRemainingColumn(compact=True))
         with Progress(*columns, *times, TextColumn("{task.fields[live]}"), console=console) as bar:
             task = bar.add_task(description, total=total_iterations, completed=start, live="compiling")
             yield lambda done, steps, metrics: bar.update(
@@ -68,7 +70,8 @@ def progress(
         iteration_rate, step_rate = clock.rates(done, steps)
         if done >= total_iterations or time.monotonic() - last_line >= every_seconds:
             last_line = time.monotonic()
-            left = f"{(total_iterations - done) / iteration_rate / 60:.0f} min left  " if iteration_rate else ""
+            minutes = (total_iterations - done) / iteration_rate / 60 if iteration_rate else None
+            left = "" if minutes is None else f"{bound}{minutes:.0f} min left  "
             _plain(console, f"{description}: {done}/{total_iterations}  {left}{_live(step_rate, metrics)}")
 
     _plain(console, f"{description}: {start}/{total_iterations}")

@@ -70,6 +70,7 @@ def run(
     if newest and (difference := another_machine(newest, config.devices)):
         console.print(difference, highlight=False, markup=False, soft_wrap=True)
     course = make_course(setup, env, directory, console, checkpoint.read_info(newest) if newest else None)
+    bar = {"start": now.iteration, "at_most": config.unlearn.stop_every > 0}
     saved, stopped = newest, False
 
     def course_after(step: Callable[[Position], Position]) -> Position:
@@ -94,7 +95,7 @@ def run(
         with (
             Log(directory, now.iteration, now.environment_steps) as log,
             stop_requests() as stop,
-            progress_bar(description, config.iterations, start=now.iteration, console=console) as report,
+            progress_bar(description, config.iterations, console=console, **bar) as report,
         ):
             now = dataclasses.replace(now, state=spread(mesh, now.state))
             now = course_after(course.begin)

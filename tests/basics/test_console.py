@@ -18,6 +18,14 @@ def test_without_a_terminal_there_are_plain_lines():
     assert lines[1].endswith("steps/s  tracking reward 0.5")
 
 
+def test_what_may_end_sooner_has_at_most_so_long_left():
+    console = Console(file=io.StringIO(), force_terminal=False, width=40)
+    with progress("forget", 3, at_most=True, every_seconds=0.0, console=console) as report:
+        for iteration in (1, 2, 3):
+            report(iteration, 100 * iteration, {})
+    assert console.file.getvalue().splitlines()[-1].startswith("forget: 3/3  at most 0 min left  ")
+
+
 def test_closing_names_files_and_the_next_command_unbroken():
     console = Console(file=io.StringIO(), force_terminal=False, width=20)
     closing(
