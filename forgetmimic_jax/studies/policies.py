@@ -7,15 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from forgetmimic_jax.basics.errors import InputError
-from forgetmimic_jax.settings.config import by_name
+from forgetmimic_jax.settings.interface import differences
 from forgetmimic_jax.settings.options import comma_separated
 from forgetmimic_jax.studies.options import Options
 
 if TYPE_CHECKING:
     from forgetmimic_jax.training.checkpoint import CheckpointInfo
-
-# A study rolls its policies out in one environment, which these settings make; see `start.with_interface`.
-INTERFACE = ("observation.", "action.", "physics.self_collision")
 
 
 def find_bases(options: Options) -> tuple[CheckpointInfo, ...]:
@@ -87,7 +84,4 @@ def _differences(info: CheckpointInfo, first: CheckpointInfo) -> Iterator[tuple[
     for name in ("robot", "clips", "library_hash"):
         if getattr(info, name) != getattr(first, name):
             yield name, getattr(info, name), getattr(first, name)
-    theirs, ours = by_name(info.config), by_name(first.config)
-    for name in {**theirs, **ours}:
-        if name.startswith(INTERFACE) and theirs.get(name) != ours.get(name):
-            yield name, theirs.get(name), ours.get(name)
+    yield from differences(info.config, first.config)

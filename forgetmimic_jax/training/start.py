@@ -14,7 +14,8 @@ from forgetmimic_jax.motion.library import DATA_DIR
 from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.ppo.state import TrainState, init_state
 from forgetmimic_jax.robot.model import roles_file
-from forgetmimic_jax.settings.config import ActionConfig, Config
+from forgetmimic_jax.settings.config import Config
+from forgetmimic_jax.settings.interface import with_interface
 from forgetmimic_jax.tracking.env import Assets, Environment, make_environment
 from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.training import checkpoint
@@ -67,16 +68,6 @@ def with_interface_of_base(config: Config) -> Config:
         return config
     info = checkpoint.read_info(Path(config.base))
     return dataclasses.replace(with_interface(config, info.config), base=str(info.path))
-
-
-def with_interface(config: Config, base: Config) -> Config:
-    """The config with what a base expects: its observations, its actions, and whether the robot's bodies collide.
-
-    Of another robot's base only the action's mode is taken: its tables are of other joints.
-    """
-    action = base.action if base.robot == config.robot else ActionConfig(mode=base.action.mode)
-    physics = dataclasses.replace(config.physics, self_collision=base.physics.self_collision)
-    return dataclasses.replace(config, observation=base.observation, action=action, physics=physics)
 
 
 def unlearned_base(config: Config) -> str | None:

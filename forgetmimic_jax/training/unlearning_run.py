@@ -13,6 +13,7 @@ from typing import Literal
 
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.settings.config import Config, EngineName, Preset, UnlearnConfig, WrenchConfig, load_config, preset
+from forgetmimic_jax.settings.interface import with_interface
 from forgetmimic_jax.settings.options import (
     Settings,
     check_same,
@@ -122,8 +123,6 @@ def config_of_new_run(options: Options) -> Config:
 
 def _on_preset(base: Config, name: str) -> Config:
     """A preset's settings with what the base's policy brings: its interface, network, bins and clips."""
-    from forgetmimic_jax.training.start import with_interface
-
     config = with_interface(dataclasses.replace(preset(name), robot=base.robot), base)
     return dataclasses.replace(
         config,
