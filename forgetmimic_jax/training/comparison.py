@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -111,6 +112,10 @@ def _by_method(paths: Sequence[Path]) -> dict[str, CheckpointInfo]:
 
 
 def completes_nothing(setup: Setup, policy: Policy) -> bool:
-    """Whether a policy completes no episode of any clip: one from each clip's first frame, one from another frame."""
+    """Whether a policy completes no episode of any clip: one from each clip's first frame, one from another frame.
+
+    On MuJoCo's C engine, whatever the run's is: MJX would be compiled for this alone.
+    """
+    setup = dataclasses.replace(setup, config=on_engine(setup.config, "native"))
     rollout = Evaluator(setup, episodes=2, seed=setup.config.seed).rollout(policy)
     return bool((rollout.length < rollout.horizon).all())
