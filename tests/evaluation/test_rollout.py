@@ -10,11 +10,13 @@ from scipy.spatial.transform import Rotation
 from forgetmimic_jax.evaluation.rollout import CHUNK, Evaluator, episode_starts, evaluation_setup, step_errors
 from forgetmimic_jax.physics import BodyState
 from forgetmimic_jax.policy.policy import Policy, init_policy
+from forgetmimic_jax.ppo.rule import Rule
+from forgetmimic_jax.settings.config import UnlearnConfig
 from forgetmimic_jax.tracking.env import EnvState
 from forgetmimic_jax.tracking.layouts import LAYOUTS
 from forgetmimic_jax.tracking.reference import align_to_anchor, lookup
 from forgetmimic_jax.tracking.reward import Pair
-from forgetmimic_jax.tracking.setup import Setup
+from forgetmimic_jax.tracking.setup import Setup, instead_of_targets
 
 EPISODES = 4  # a clip; the library has two
 
@@ -100,6 +102,23 @@ def test_a_policy_that_outputs_zero_is_the_zero_action(evaluator, zero_action, p
     rollout = evaluator.rollout(silent)  # its standard deviation is 1: sampled actions would be far from zero
     np.testing.assert_array_equal(rollout.length, zero_action.length)
     np.testing.assert_allclose(rollout.tracking_reward, zero_action.tracking_reward, atol=1e-6)
+
+
+def test_under_a_rule_a_target_is_asked_for_something_else_and_runs_on(tiny_setup, library):
+    """`turn` runs on for 0.5 s, which is 25 steps; asked to stand, the zero action is the default pose."""
+    unlearn = UnlearnConfig(("turn",), "stand", {}, "stand")
+    config = dataclasses.replace(tiny_setup.config, unlearn=unlearn)
+    setup = dataclasses.replace(
+        tiny_setup, config=config, instead=instead_of_targets(config, tiny_setup.robot, library)
+    )
+    plain = Evaluator(setup, episodes=EPISODES, seed=0)
+    asked = Evaluator(setup, episodes=EPISODES, seed=0, rule=Rule(runs_on=0.5, asked=True))
+    longer = np.asarray(asked.start().horizon) - np.asarray(plain.start().horizon)
+    np.testing.assert_array_equal(longer, 25 * (plain.clip == library.names.index("turn")))
+    one, other = plain.rollout(None), asked.rollout(None)
+    target = plain.clip == library.names.index("turn")
+    np.testing.assert_array_equal(one.tracking_reward[~target, 0], other.tracking_reward[~target, 0])
+    assert (one.tracking_reward[target, 0] != other.tracking_reward[target, 0]).all()
 
 
 @pytest.fixture(scope="module")
