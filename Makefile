@@ -37,7 +37,7 @@ FLAGS = $(foreach name,$(filter-out ARGS PYTHON SWEEP,$(given)),$(call flag,$(na
 
 COMMANDS = pretrain train unlearn evaluate evidence export play video report motions robot bench
 STUDIES = validity comparison penalty heat_map motion_types physical_behaviour training_dynamics relearning membership \
-	number_of_targets overlap generality from_scratch
+	number_of_targets stand overlap generality from_scratch
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:

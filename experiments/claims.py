@@ -22,6 +22,7 @@ from experiments import (
     penalty,
     physical_behaviour,
     relearning,
+    stand,
     training_dynamics,
     validity,
 )
@@ -48,6 +49,8 @@ STUDIES: Mapping[str, Study] = {
     "g1/training_dynamics": training_dynamics.STUDY,
     "g1/relearning": relearning.STUDY,
     "g1/membership": membership.STUDY,
+    "g1/stand": stand.STUDY,
+    "h2/stand": stand.STUDY,
     "g1/overlap": overlap.STUDY,
     "g1/generality": generality.STUDY,
     "g1/from_scratch": from_scratch.STUDY,

@@ -5,8 +5,9 @@ lagging  Most of the steps for the clips that are new or learning; on the clips 
          to it. Ends when every clip is mastered or stuck.
 stuck    A specialist for every clip that is not mastered, one after the other: training on that clip alone from the
          best policy. Ends when each has mastered its clip or makes no progress.
-distil   The specialists and the best policy become one. No iterations. Then `lagging` again, while there is time.
-settle   All clips, with a step size that falls.
+distil   The specialists and the best policy become one. No iterations. Then `lagging` again, or where it is too late for
+         that, another specialist for every clip that is not mastered.
+settle   All clips, with a step size that falls and a KL to the best policy.
 
 Every phase starts from the best policy, which is the one with the highest mean tracking (survival-weighted), and has a
 latest end in iterations. Everything here is plain values, so that a curriculum can be written as JSON.
@@ -161,10 +162,10 @@ def advance(config: Config, curriculum: Curriculum, found: Mapping[str, Measured
 
 
 def _after_broad(config: Config, seen: Curriculum, done: float) -> Curriculum:
-    """The clips that lag, or where none does or no time is left, the end."""
+    """The clips that lag; where it is too late for that, specialists; where none lags, the end."""
     if seen.unmastered(config.pretrain) and done < config.pretrain.lagging_until:
         return _begin(seen, "lagging")
-    return _begin(seen, "settle")
+    return _after_lagging(config, seen, done)
 
 
 def _after_lagging(config: Config, seen: Curriculum, done: float) -> Curriculum:
@@ -232,8 +233,9 @@ def settings_of(config: Config, curriculum: Curriculum) -> Settings:
     best_kl = {name: 0.0 for name in curriculum.clips}
     if curriculum.phase == "lagging" and best is not None:
         best_kl = {name: rules.best_kl * (clip.success >= rules.mastered) for name, clip in best.clips.items()}
-    if curriculum.phase == "settle":  # the KL goes with the square of the step size, which falls evenly
+    if curriculum.phase == "settle":  # the KL of an iteration goes with the square of the step size, which falls evenly
         length = settle_evaluations(config)
+        best_kl = dict.fromkeys(best_kl, rules.best_kl)
         target_kl *= (max(1, length - curriculum.evaluations) / length) ** 2
     shares = step_shares(config, curriculum)
     starts = {name: share / max(1.0, curriculum.clips[name].last.steps) for name, share in shares.items()}

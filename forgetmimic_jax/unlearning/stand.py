@@ -68,7 +68,7 @@ def regression(config: Config, batch: Batch, now: Prediction, iteration: Array) 
 
 
 # A regression: the number of gradient steps decides, and a rollout serves many of them.
-PACE = Pace({"cpu": 160, "paper": 400}, {"cpu": {**SHORT, "minibatches": 12, "epochs": 4}}, {"cpu": 0.5})
+PACE = Pace({"cpu": 140, "paper": 400}, {"cpu": {**SHORT, "branches": 1, "minibatches": 12, "epochs": 4}}, {"cpu": 0.5})
 METHOD = Method(
     loss=regression,
     teach=taught_action,

@@ -35,7 +35,7 @@ from forgetmimic_jax.unlearning.registry import unlearning_config
 
 STUDIES = (
     *("validity", "comparison", "penalty", "heat_map", "motion_types", "physical_behaviour", "training_dynamics"),
-    *("relearning", "membership", "number_of_targets", "from_scratch"),
+    *("relearning", "membership", "number_of_targets", "stand", "from_scratch"),
 )
 
 FIRST, SECOND = "base 0, seed 0", "base 0, seed 1"

@@ -182,8 +182,14 @@ def test_experts_are_distilled_and_the_rest_lags_again():
     lagging = advance(CONFIG, distil, found(0.86, 0.79, 0.1), 80)
     assert (lagging.phase, lagging.experts, lagging.best.number) == ("lagging", {}, 9)
     assert settings_of(CONFIG, lagging).best_kl == (RULES.best_kl, RULES.best_kl, 0.0)
-    late = advance(CONFIG, distil, found(0.86, 0.79, 0.1), 700)
-    assert late.phase == "settle"
+
+
+def test_where_it_is_too_late_for_lagging_specialists_come_again_until_there_is_no_time_left():
+    distil = after(STUCK, found(0.3, 0.8, 0.0), found(0.3, 0.5, 0.1), found(0.3, 0.5, 0.1), first=6)
+    again = advance(CONFIG, distil, found(0.86, 0.79, 0.1), 700)
+    assert (again.phase, again.specialists, again.experts) == ("stuck", ("flip",), {})
+    assert advance(CONFIG, distil, found(0.86, 0.95, 0.95), 700).phase == "settle"
+    assert advance(CONFIG, distil, found(0.86, 0.79, 0.1), 900).phase == "settle"
 
 
 def test_specialists_share_the_time_that_is_left():
@@ -201,6 +207,7 @@ def test_settling_lasts_a_tenth_and_its_kl_falls_to_nothing():
     kl = []
     for number in range(10):
         kl.append(settings_of(CONFIG, now).target_kl)
+        assert settings_of(CONFIG, now).best_kl == (RULES.best_kl,) * 3
         assert now.phase == "settle"
         now = advance(CONFIG, now, found(0.86, 0.6, 0.2), 910 + 10 * number)
     assert now.phase == "done"

@@ -1,0 +1,168 @@
+"""What does a robot do that is asked for a motion it forgot by METHOD=stand? (ours)
+
+Each group of targets is forgotten by `stand`, from every base and with every seed.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from forgetmimic_jax.basics.files import read_rows
+from forgetmimic_jax.evaluation.plots import bars, new_figure
+from forgetmimic_jax.evaluation.repeats import over_repeats
+from forgetmimic_jax.evaluation.statistics import Estimate
+from forgetmimic_jax.evaluation.tables import markdown_table, number, percent
+from forgetmimic_jax.settings.options import comma_separated
+from forgetmimic_jax.studies.claim import Finding, finding
+from forgetmimic_jax.studies.conduct import main
+from forgetmimic_jax.studies.findings import share
+from forgetmimic_jax.studies.lab import Lab
+from forgetmimic_jax.studies.study import Document, Study
+from forgetmimic_jax.studies.targets import GROUPS
+from forgetmimic_jax.studies.variants import within
+from forgetmimic_jax.unlearning.stand import PACE
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+WHERE = {"from_frame_0": "from frame 0", "all_starts": "all starts"}
+RATES = {"upright_rate": "upright", "impact_rate": "impact"}
+SUCCESS, SKILL, CONTENT, CHANGE, SECONDS = "success_from_frame_0", "skill", "content", "kept_change", "seconds"
+BOUNDS = {"skill": 0.10, "content": 0.15, "upright": 0.80, "impact": 0.12, "kept": -0.02}
+
+
+def measure(lab: Lab) -> dict[str, Any]:
+    """By group of targets and by repeat: what the targets lost, what the robot does instead, and what was kept."""
+    runs = {
+        (" + ".join(targets), repeat): {"method": "stand", "targets": ",".join(targets)}
+        for repeat in lab.repeats
+        for targets in groups(lab)
+    }
+    found: dict[str, dict[str, Any]] = {}
+    for (label, repeat), folder in lab.run(runs, "stand").items():
+        found.setdefault(label, {})[str(repeat)] = numbers(folder)
+    return {"targets": found}
+
+
+def groups(lab: Lab) -> list[tuple[str, ...]]:
+    """The groups of targets: combat, dance and locomotion of the G1; of other robots the library's default targets."""
+    if lab.options.robot != "g1" or lab.options.targets is not None:
+        return [lab.targets]
+    there = [tuple(clip for clip in comma_separated(group) if clip in lab.bases[0].clips) for group in GROUPS]
+    return [targets for targets in there if targets] or [lab.targets]
+
+
+def numbers(folder: Path) -> dict[str, float]:
+    """The numbers of a finished run."""
+    policies = json.loads((folder / "evaluation.json").read_text())["policies"]
+    base, target, kept = policies["base"], policies["unlearned"]["target"], policies["unlearned"]["kept"]
+    result = {
+        SUCCESS: target["success_rate_from_frame_0"]["mean"],
+        SKILL: target.get("skill", {}).get("mean"),
+        CONTENT: target["unbounded"]["all_starts"].get("motion_content", {}).get("mean"),
+        CHANGE: kept["success_rate"]["mean"] - base["kept"]["success_rate"]["mean"],
+        SECONDS: sum(seconds(of) for of in (folder, folder.with_name(f"{folder.name}-stand"))),
+    }
+    for where in WHERE:
+        result |= {f"{name}_{where}": target["unbounded"][where].get(name, {}).get("mean") for name in RATES}
+    return {name: value for name, value in result.items() if value is not None}
+
+
+def seconds(folder: Path) -> float:
+    """What the iterations of a run took."""
+    rows = read_rows(folder / "metrics.jsonl") if (folder / "metrics.jsonl").exists() else []
+    return float(sum(row["seconds"] for row in rows))
+
+
+def estimate(runs: Mapping[str, Mapping[str, float]], name: str) -> Estimate | None:
+    """A number over the repeats that have it."""
+    values = {repeat: of[name] for repeat, of in runs.items() if name in of}
+    return over_repeats(values) if values else None
+
+
+def rate(runs: Mapping[str, Mapping[str, float]], name: str) -> Estimate | None:
+    """A rate over the repeats, its interval cut at 0 and 1."""
+    value = estimate(runs, name)
+    return within(value, 0.0, 1.0) if value else None
+
+
+def body(document: Document) -> str:
+    """A row a group of targets."""
+    rows = []
+    for label, runs in document["results"]["targets"].items():
+        cells = [str(len(runs)), percent(rate(runs, SUCCESS)), percent(estimate(runs, SKILL))]
+        cells.append(number(estimate(runs, CONTENT), 2))
+        cells += [percent(rate(runs, f"{name}_{where}")) for name in RATES for where in WHERE]
+        cells += [percent(estimate(runs, CHANGE)), number(minutes(runs), 1)]
+        rows.append([label, *cells])
+    header = ["targets", "n", f"success, {WHERE['from_frame_0']}", "skill retained", "motion content"]
+    header += [f"{words}, {where}" for words in RATES.values() for where in WHERE.values()]
+    header += ["kept success minus base", "minutes"]
+    note = (
+        "upright: share of the target episodes without a fall to the clip's end and 3 s longer, with no other "
+        "termination. impact: share with a force of the floor above one body weight on a body that is no foot. motion "
+        "content: 1 for the clip's own movement, 0 for a robot that stands. minutes: of the iterations, with those in "
+        "which the teacher learns to stand, without the evaluation. Late starts of a short clip can succeed by "
+        "standing, since most of a clip's end is standing.\n"
+    )
+    return f"{markdown_table(header, rows)}\n{note}"
+
+
+def minutes(runs: Mapping[str, Mapping[str, float]]) -> Estimate:
+    """How long the runs trained."""
+    return over_repeats({repeat: of[SECONDS] / 60.0 for repeat, of in runs.items()})
+
+
+def findings(document: Document) -> Iterator[Finding]:
+    """Forgotten, standing, and kept, group by group."""
+    for label, runs in document["results"]["targets"].items():
+        skill, content = estimate(runs, SKILL), estimate(runs, CONTENT)
+        if skill:
+            evidence = f"skill retained {percent(skill)}; bound {share(BOUNDS['skill'])}"
+            yield finding(f"{label}: the skill on the targets is gone", skill, BOUNDS["skill"], evidence)
+        if content:
+            evidence = f"motion content {number(content, 2)}; bound {BOUNDS['content']:g}"
+            yield finding(f"{label}: the robot shows none of the movement", content, BOUNDS["content"], evidence)
+        upright, impact = rate(runs, "upright_rate_all_starts"), rate(runs, "impact_rate_all_starts")
+        if upright and impact:
+            evidence = f"upright {percent(upright)}; bound {share(BOUNDS['upright'])}"
+            claim = f"{label}: the robot stays upright"
+            yield finding(claim, upright, BOUNDS["upright"], evidence, below=False, main=True)
+            evidence = f"impacts {percent(impact)}; bound {share(BOUNDS['impact'])}"
+            yield finding(f"{label}: the robot does not hit the floor", impact, BOUNDS["impact"], evidence)
+        change = over_repeats({repeat: of[CHANGE] for repeat, of in runs.items()})
+        evidence = f"kept success minus the base's {percent(change)}; bound {share(BOUNDS['kept'])}"
+        yield finding(f"{label}: the other clips are kept", change, BOUNDS["kept"], evidence, below=False)
+
+
+def draw(document: Document) -> Figure:
+    """Upright and impact rates of every group."""
+    found = document["results"]["targets"]
+    figure = new_figure(width=9.0, height=3.5)
+    for place, (name, words) in enumerate(RATES.items()):
+        axes = figure.add_subplot(1, 2, place + 1)
+        series = {where: [rate(runs, f"{name}_{at}") for runs in found.values()] for at, where in WHERE.items()}
+        bars(axes, list(found), series)
+        axes.set_ylim(0.0, 1.0)
+        axes.set_title(words, fontsize="medium")
+    figure.axes[0].legend(fontsize="small", frameon=False)
+    return figure
+
+
+STUDY = Study(
+    name="stand",
+    title="What does a robot do that is asked for a motion it forgot by METHOD=stand?",
+    claim="Asked for a forgotten motion, the robot stays upright.",
+    ours=True,
+    iterations=PACE.iterations,
+    measure=measure,
+    body=body,
+    draw=draw,
+    findings=findings,
+)
+
+if __name__ == "__main__":
+    main(STUDY)
