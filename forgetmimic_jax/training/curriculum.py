@@ -5,8 +5,8 @@ lagging  Most of the steps for the clips that are new or learning; on the clips 
          to it. Ends when every clip is mastered or stuck.
 stuck    A specialist for every clip that is not mastered, one after the other: training on that clip alone from the
          best policy. Ends when each has mastered its clip or makes no progress.
-distil   The specialists and the best policy become one. No iterations. Then `lagging` again, or where it is too late for
-         that, another specialist for every clip that is not mastered.
+distil   The specialists and the best policy become one. No iterations. Then `lagging` again, or where it is too late
+         for that, another specialist for every clip that is not mastered.
 settle   All clips, with a step size that falls and a KL to the best policy.
 
 Every phase starts from the best policy, which is the one with the highest mean tracking (survival-weighted), and has a
