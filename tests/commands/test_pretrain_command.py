@@ -34,11 +34,13 @@ def test_a_library_of_ones_own_starts_from_the_shipped_base_with_its_observation
     shipped = DATA_DIR / "g1" / "base"
     found = config_of(library=library_folder)
     assert found.base == str(shipped)
-    assert found.observation == load_config(shipped / "config.yaml").observation != Config().observation
+    assert found.observation == load_config(shipped / "config.yaml").observation
     fresh = config_of(library=library_folder, base=Path("none"))
     assert (fresh.base, fresh.observation) == (None, Config().observation)
     other = DATA_DIR / "h2" / "base"
-    assert config_of(library=library_folder, base=other).base == str(other)
+    found = config_of(library=library_folder, base=other)
+    assert found.base == str(other)
+    assert found.observation == load_config(other / "config.yaml").observation != Config().observation
 
 
 def test_a_control_is_trained_from_nothing_without_its_clips(library_folder, refused, tmp_path):
