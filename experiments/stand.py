@@ -1,28 +1,29 @@
-"""What does a robot do that is asked for a motion it forgot by METHOD=stand? (ours)
+"""What does a robot do on a motion that it forgot by METHOD=stand? (ours)
 
 Each group of targets is forgotten by `stand`, from every base and with every seed.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from forgetmimic_jax.basics.files import read_rows
+from forgetmimic_jax.evaluation.document import read_evaluation
+from forgetmimic_jax.evaluation.metrics import BASE, UNLEARNED
 from forgetmimic_jax.evaluation.plots import bars, new_figure
 from forgetmimic_jax.evaluation.repeats import over_repeats
 from forgetmimic_jax.evaluation.statistics import Estimate
 from forgetmimic_jax.evaluation.tables import markdown_table, number, percent
-from forgetmimic_jax.settings.options import comma_separated
 from forgetmimic_jax.studies.claim import Finding, finding
 from forgetmimic_jax.studies.conduct import main
 from forgetmimic_jax.studies.findings import share
 from forgetmimic_jax.studies.lab import Lab
 from forgetmimic_jax.studies.study import Document, Study
-from forgetmimic_jax.studies.targets import GROUPS
+from forgetmimic_jax.studies.targets import usual_groups
 from forgetmimic_jax.studies.variants import within
+from forgetmimic_jax.tracking.stand import STAND
 from forgetmimic_jax.unlearning.stand import PACE
 
 if TYPE_CHECKING:
@@ -48,27 +49,32 @@ def measure(lab: Lab) -> dict[str, Any]:
 
 
 def groups(lab: Lab) -> list[tuple[str, ...]]:
-    """The groups of targets: combat, dance and locomotion of the G1; of other robots the library's default targets."""
-    if lab.options.robot != "g1" or lab.options.targets is not None:
-        return [lab.targets]
-    there = [tuple(clip for clip in comma_separated(group) if clip in lab.bases[0].clips) for group in GROUPS]
-    return [targets for targets in there if targets] or [lab.targets]
+    """Combat, dance and locomotion; the targets that the study names, or where the library has none of these."""
+    return ([] if lab.options.targets else usual_groups(lab)) or [lab.targets]
 
 
 def numbers(folder: Path) -> dict[str, float]:
-    """The numbers of a finished run."""
-    policies = json.loads((folder / "evaluation.json").read_text())["policies"]
-    base, target, kept = policies["base"], policies["unlearned"]["target"], policies["unlearned"]["kept"]
-    result = {
-        SUCCESS: target["success_rate_from_frame_0"]["mean"],
-        SKILL: target.get("skill", {}).get("mean"),
-        CONTENT: target["unbounded"]["all_starts"].get("motion_content", {}).get("mean"),
-        CHANGE: kept["success_rate"]["mean"] - base["kept"]["success_rate"]["mean"],
-        SECONDS: sum(seconds(of) for of in (folder, folder.with_name(f"{folder.name}-stand"))),
+    """The numbers of a finished run; those that are undefined are left out."""
+    policies = read_evaluation(folder / "evaluation.json").policies
+    base, unlearned = policies[BASE], policies[UNLEARNED]
+    assert base.kept is not None
+    assert unlearned.kept is not None
+    assert unlearned.target is not None
+    target, unbounded = unlearned.target, unlearned.target.unbounded
+    assert unbounded is not None
+    found = {
+        SUCCESS: target.success_rate_from_frame_0,
+        SKILL: target.skill,
+        CONTENT: unbounded.all_starts.motion_content,
+        "kept": unlearned.kept.success_rate,
+        "base": base.kept.success_rate,
     }
     for where in WHERE:
-        result |= {f"{name}_{where}": target["unbounded"][where].get(name, {}).get("mean") for name in RATES}
-    return {name: value for name, value in result.items() if value is not None}
+        found |= {f"{name}_{where}": getattr(getattr(unbounded, where), name) for name in RATES}
+    result = {name: value.mean for name, value in found.items() if value is not None and value.mean is not None}
+    result[CHANGE] = result.pop("kept") - result.pop("base")
+    result[SECONDS] = sum(seconds(of) for of in (folder, folder.with_name(f"{folder.name}-{STAND}")))
+    return result
 
 
 def seconds(folder: Path) -> float:
@@ -154,8 +160,8 @@ def draw(document: Document) -> Figure:
 
 STUDY = Study(
     name="stand",
-    title="What does a robot do that is asked for a motion it forgot by METHOD=stand?",
-    claim="Asked for a forgotten motion, the robot stays upright.",
+    title="What does a robot do on a motion that it forgot by METHOD=stand?",
+    claim="On a motion that it forgot by METHOD=stand, the robot stays upright.",
     ours=True,
     iterations=PACE.iterations,
     measure=measure,

@@ -41,13 +41,13 @@ class Evaluator:
     """Rolls policies out on the same episodes of one library. Compiled once, used for any number of policies."""
 
     def __init__(self, setup: Setup, *, episodes: int, seed: int, noise: bool = False, rule: Rule | None = None):
-        """With a rule, what the targets' episodes are asked for and what ends them is as in training under it."""
+        """With a rule, the reference of a target clip and what ends its episodes are as in training under that rule."""
         setup, rule = evaluation_setup(setup), rule or Rule()
         self.config = setup.config
         self.clip, self.start_frame = episode_starts(np.asarray(setup.library.length), episodes, seed)
         self._seed = seed
         self._env = tracking.make_environment(
-            setup, len(self.clip), noisy=noise, runs_on=rule.runs_on, asked=rule.asked
+            setup, len(self.clip), noisy=noise, runs_on=rule.runs_on, replace_reference=rule.replace_reference
         )
         self._assets = tracking.make_assets(setup)
         self._begin = jax.jit(self._begin_episodes)

@@ -34,7 +34,7 @@ class Rule:
         teach: (environment, assets, running episodes) → the action [env, joint] that a teacher takes there, in the
             policy's order of joints. The loss finds it in the batch's transition.
         runs_on: s that an episode of a target clip lasts after the clip's end; above 0, only a fall terminates it.
-        asked: whether the reference of a target clip is what to do instead of it.
+        replace_reference: whether the reference of a target clip is replaced by what to do instead of it.
         simulate: whether steps are simulated, or reference states with reset noise stand for them.
     """
 
@@ -43,5 +43,5 @@ class Rule:
     loss: Callable[[Config, Batch, Prediction, Array], tuple[Array, dict[str, Array]]] = ppo_loss
     teach: Callable[[Environment, Assets, EnvState], Array] | None = None
     runs_on: float = 0.0
-    asked: bool = False
+    replace_reference: bool = False
     simulate: bool = True

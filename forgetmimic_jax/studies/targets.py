@@ -20,6 +20,12 @@ if TYPE_CHECKING:
 GROUPS = ("punch,kick", "dance_a,dance_b", "run")  # combat, dance and locomotion, as in the paper
 
 
+def usual_groups(lab: Lab) -> list[tuple[str, ...]]:
+    """Combat, dance and locomotion, as far as the clips of a lab's bases have them."""
+    there = [tuple(clip for clip in comma_separated(group) if clip in lab.bases[0].clips) for group in GROUPS]
+    return [targets for targets in there if targets]
+
+
 def targets_study(
     groups: tuple[str, ...] = GROUPS,
     name: str = "targets",
@@ -32,10 +38,7 @@ def targets_study(
     def variants(lab: Lab) -> dict[str, dict[str, Any]]:
         from forgetmimic_jax.tracking.setup import check_targets
 
-        conditions = [comma_separated(group) for group in groups]
-        if groups == GROUPS:  # as far as the robot's library has them
-            there = [tuple(clip for clip in targets if clip in lab.bases[0].clips) for targets in conditions]
-            conditions = [targets for targets in there if targets]
+        conditions = usual_groups(lab) if groups == GROUPS else [comma_separated(group) for group in groups]
         for targets in conditions:
             check_targets(targets, lab.bases[0].clips)
         return {" + ".join(targets): {"targets": ",".join(targets)} for targets in conditions}

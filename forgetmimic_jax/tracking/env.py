@@ -90,7 +90,7 @@ class Environment:
     num_envs: int
     noisy: bool  # reset noise, pushes, randomisation and observation noise
     runs_on: int = 0  # control steps that a target's episode lasts after the clip's end; with any, only a fall ends it
-    asked: bool = False  # whether a robot at a target clip is asked for what it shall do instead
+    replace_reference: bool = False  # whether the reference of a target clip is what to do instead of it
 
     @property
     def layout(self) -> Layout:
@@ -112,7 +112,7 @@ def make_environment(
     *,
     noisy: bool | None = None,
     runs_on: float = 0.0,
-    asked: bool = False,
+    replace_reference: bool = False,
     shards: int = 1,
 ) -> Environment:
     """An environment of `num_envs` robots.
@@ -123,7 +123,7 @@ def make_environment(
         noisy: by default the config's.
         runs_on: s that an episode of a target clip lasts after the clip's end, with the last frame held. Above 0, such
             an episode is terminated by a fall only.
-        asked: whether the reference of a target clip is what to do instead of it, at the place of the robot.
+        replace_reference: whether the reference of a target clip is what to do instead of it, at the robot's place.
         shards: of this process, each with `num_envs` robots, that step at the same time.
     """
     config, robot = setup.config, setup.robot
@@ -131,7 +131,8 @@ def make_environment(
     physics = dataclasses.replace(config.physics, substeps=1) if assisted else config.physics  # see `_simulate`
     engine = make_engine(robot, physics, num_envs, shards)
     noisy = config.noise.enabled if noisy is None else noisy
-    return Environment(config, robot, engine, num_envs, noisy, round(runs_on / config.physics.control_step), asked)
+    steps = round(runs_on / config.physics.control_step)
+    return Environment(config, robot, engine, num_envs, noisy, steps, replace_reference)
 
 
 def make_assets(setup: Setup) -> Assets:
@@ -184,10 +185,12 @@ def start_episodes(
     )
 
 
-def to_follow(env: Environment, assets: Assets, state: EnvState, ahead: int) -> Frames:
-    """The frame [env] that the robots are asked for, `ahead` frames from now."""
+def reference_of(env: Environment, assets: Assets, state: EnvState, ahead: int) -> Frames:
+    """The reference frame [env], `ahead` frames from now: the clip's, or what to do instead of a target."""
     clip = lookup(assets.library, state.clip, state.frame + ahead)
-    return _where(assets.is_target[state.clip], instead_of_clip(env, assets, state, ahead), clip) if env.asked else clip
+    if not env.replace_reference:
+        return clip
+    return _where(assets.is_target[state.clip], instead_of_clip(env, assets, state, ahead), clip)
 
 
 def instead_of_clip(env: Environment, assets: Assets, state: EnvState, ahead: int) -> Frames:
@@ -239,7 +242,7 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
         key: for pushes.
     """
     config, robot = env.config, env.robot
-    reference = to_follow(env, assets, state, ahead=1)
+    reference = reference_of(env, assets, state, ahead=1)
     action = in_robot_order(robot, action)
     # The joint controller regulates what its encoders read, so their bias moves the robot, not the reading.
     joint_target = to_joint_target(config.action.mode, assets.robot, reference, action) - state.encoder_bias
@@ -259,7 +262,7 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
     physics, bodies = (_where(diverged, old, new) for old, new in ((state.physics, physics), (state.bodies, bodies)))
 
     joint_pos, joint_vel = physics.qpos[:, 7:], physics.qvel[:, 6:]
-    reference = to_follow(env, assets, dataclasses.replace(state, bodies=bodies), ahead=1)
+    reference = reference_of(env, assets, dataclasses.replace(state, bodies=bodies), ahead=1)
     aligned = align_to_anchor(reference, robot.anchor, bodies.pos[:, robot.anchor], bodies.quat[:, robot.anchor])
     pair = Pair(reference, aligned, bodies, joint_pos, joint_vel, robot.anchor)
     kernels = reward.tracking_kernels(pair)
@@ -326,7 +329,7 @@ def moment_of(env: Environment, assets: Assets, state: EnvState) -> Moment:
     """What the observations of the running episodes are made of."""
     return Moment(
         robot=assets.robot,
-        reference=to_follow(env, assets, state, ahead=1),
+        reference=reference_of(env, assets, state, ahead=1),
         physics=state.physics,
         bodies=state.bodies,
         last_action=state.last_action,

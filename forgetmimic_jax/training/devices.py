@@ -125,7 +125,12 @@ def shard_environment(mesh: Mesh | None, setup: Setup, env: Environment) -> Envi
         return env
     runs_on, shards = env.runs_on * env.control_step, len(mesh.local_devices)
     return make_environment(
-        setup, env.num_envs // mesh.size, noisy=env.noisy, runs_on=runs_on, asked=env.asked, shards=shards
+        setup,
+        env.num_envs // mesh.size,
+        noisy=env.noisy,
+        runs_on=runs_on,
+        replace_reference=env.replace_reference,
+        shards=shards,
     )
 
 

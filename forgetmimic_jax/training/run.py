@@ -57,7 +57,7 @@ def run(
     base = unlearned_base(config)
     newest = prepare_folder(directory, resume=resume)
     rule, assets = rule or method_of(config), make_assets(setup)
-    env = make_environment(setup, config.ppo.num_envs, runs_on=rule.runs_on, asked=rule.asked)
+    env = make_environment(setup, config.ppo.num_envs, runs_on=rule.runs_on, replace_reference=rule.replace_reference)
     if newest is None:
         now = Position(start_state(setup, env, assets), assets, 0, steps_before(config))
     else:
@@ -70,7 +70,7 @@ def run(
     if newest and (difference := another_machine(newest, config.devices)):
         console.print(difference, highlight=False, markup=False, soft_wrap=True)
     course = make_course(setup, env, directory, console, checkpoint.read_info(newest) if newest else None)
-    bar = {"start": now.iteration, "at_most": config.unlearn.stop_every > 0}
+    at_most = config.unlearn.stop_every > 0
     saved, stopped = newest, False
 
     def course_after(step: Callable[[Position], Position]) -> Position:
@@ -95,7 +95,9 @@ def run(
         with (
             Log(directory, now.iteration, now.environment_steps) as log,
             stop_requests() as stop,
-            progress_bar(description, config.iterations, console=console, **bar) as report,
+            progress_bar(
+                description, config.iterations, start=now.iteration, at_most=at_most, console=console
+            ) as report,
         ):
             now = dataclasses.replace(now, state=spread(mesh, now.state))
             now = course_after(course.begin)

@@ -1,9 +1,10 @@
-"""Who teaches the method `stand`: the base asked to stand, where it stays upright, or what training makes of it."""
+"""The teacher of the method `stand`: the base, where it stays upright, or the base after training to stand."""
 
 from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -22,26 +23,27 @@ from forgetmimic_jax.training.run import run
 
 EPISODES = 20  # a target
 ENOUGH = 0.95  # upright rate of a base that needs no training
-ASKED = Rule(runs_on=HOLD_SECONDS, asked=True)  # PPO; the reference of a target is the stand, only a fall ends it
-# The teacher needs none of the clips any more: nothing holds it near the base.
-LEARNING = {"minibatches": 4, "epochs": 4, "base_kl": 0.0, "equal_clips": False}
+# PPO; the reference of a target clip is the stand, and only a fall terminates an episode.
+STANDING = Rule(runs_on=HOLD_SECONDS, replace_reference=True)
+# The teacher needs no clip any more, so it has no KL to the base.
+LEARNING: dict[str, Any] = {"minibatches": 4, "epochs": 4, "base_kl": 0.0, "equal_clips": False}
 
 
-def upright_when_asked(setup: Setup, policy: Policy) -> float:
-    """Share of the episodes without a fall, in which a policy is asked to stand from the states of the targets.
+def upright_rate(setup: Setup, policy: Policy) -> float:
+    """Share of the episodes without a fall. They start in the target clips, and their reference is the stand.
 
-    They start as those of an evaluation do: half at frame 0, half spread over the clip.
+    Half of them start at frame 0, half are spread over the clip, as in an evaluation.
     """
     targets = dataclasses.replace(setup, library=only_clips(setup.library, setup.config.unlearn.targets))
-    rollout = Evaluator(targets, episodes=EPISODES, seed=setup.config.seed, rule=ASKED).rollout(policy)
+    rollout = Evaluator(targets, episodes=EPISODES, seed=setup.config.seed, rule=STANDING).rollout(policy)
     return agreed(float((rollout.length == rollout.horizon).mean()))
 
 
 def standing_teacher(setup: Setup, directory: Path) -> Policy:
-    """The base, if it stays upright where it is asked to stand; else the base after training on that.
+    """The base, if it stays upright with the stand as its reference; else the base after training on that.
 
-    The training is PPO from the base. Its episodes start from the states of the targets, their reference is the stand,
-    and only a fall ends them early. Its folder is `directory` with `-stand` at the end. One that is there already
+    The training is PPO from the base. Its episodes start in the target clips, their reference is the stand, and only a
+    fall terminates them. Its folder is `directory` with `-stand` at the end. One that is there already
     continues.
 
     Raises:
@@ -49,12 +51,12 @@ def standing_teacher(setup: Setup, directory: Path) -> Policy:
         Interrupted: Ctrl-C during the training.
     """
     assert setup.base is not None
-    console, upright = Console(), upright_when_asked(setup, setup.base)
-    said = f"asked to stand in the middle of a target, the base stays upright in {upright:.0%} of the episodes"
+    console, upright = Console(), upright_rate(setup, setup.base)
+    said = f"with the stand as the reference, the base stays upright in {upright:.0%} of the targets' episodes"
     if upright >= ENOUGH:
         console.print(said, highlight=False, soft_wrap=True)
         return setup.base
-    console.print(f"{said}: it learns that first", highlight=False, soft_wrap=True)
+    console.print(f"{said}; it learns to stand first", highlight=False, soft_wrap=True)
     learning = _learning(setup)
     folder = directory.with_name(f"{directory.name}-{STAND}")
     resume = newest_checkpoint(folder) is not None
@@ -62,11 +64,11 @@ def standing_teacher(setup: Setup, directory: Path) -> Policy:
     if resume and dataclasses.replace(load_config(folder / CONFIG), devices=devices) != learning.config:
         raise InputError(f"{folder}: is of a run with other settings; remove it, or choose another --output")
     try:
-        _, state = run(learning, folder, description="learn to stand", resume=resume, rule=ASKED)
+        _, state = run(learning, folder, description="learn to stand", resume=resume, rule=STANDING)
     except Interrupted:
         text = f"stopped while the base learned to stand; saved {folder}; the same command continues"
         raise Interrupted(text) from None
-    console.print(f"now it does in {upright_when_asked(setup, state.policy):.0%}", highlight=False)
+    console.print(f"after training it stays upright in {upright_rate(setup, state.policy):.0%}", highlight=False)
     return state.policy
 
 

@@ -476,8 +476,10 @@ def test_a_base_that_cannot_stand_learns_that_first_and_then_teaches(options, tm
 
     unlearn.main(stand(2, iterations=2))
     printed = capsys.readouterr().out
-    assert re.search(r"the base stays upright in \d+% of the episodes: it learns that first$", printed, re.M)
-    assert re.search(r"^now it does in \d+%$", printed, re.M)
+    assert re.search(
+        r"the base stays upright in \d+% of the targets' episodes; it learns to stand first$", printed, re.M
+    )
+    assert re.search(r"^after training it stays upright in \d+%$", printed, re.M)
     learned = checkpoint.read_info(tmp_path / "run-stand" / "checkpoints" / "00000002")
     assert (learned.config.sampling.target_share, learned.config.unlearn.method) == (1.0, "stand")
     config = load_config(tmp_path / "run" / "config.yaml")

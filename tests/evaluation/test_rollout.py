@@ -104,18 +104,18 @@ def test_a_policy_that_outputs_zero_is_the_zero_action(evaluator, zero_action, p
     np.testing.assert_allclose(rollout.tracking_reward, zero_action.tracking_reward, atol=1e-6)
 
 
-def test_under_a_rule_a_target_is_asked_for_something_else_and_runs_on(tiny_setup, library):
-    """`turn` runs on for 0.5 s, which is 25 steps; asked to stand, the zero action is the default pose."""
+def test_under_a_rule_a_target_has_another_reference_and_runs_on(tiny_setup, library):
+    """`turn` runs on for 0.5 s, which is 25 steps; with the stand as its reference the zero action stands."""
     unlearn = UnlearnConfig(("turn",), "stand", {}, "stand")
     config = dataclasses.replace(tiny_setup.config, unlearn=unlearn)
     setup = dataclasses.replace(
         tiny_setup, config=config, instead=instead_of_targets(config, tiny_setup.robot, library)
     )
     plain = Evaluator(setup, episodes=EPISODES, seed=0)
-    asked = Evaluator(setup, episodes=EPISODES, seed=0, rule=Rule(runs_on=0.5, asked=True))
-    longer = np.asarray(asked.start().horizon) - np.asarray(plain.start().horizon)
+    other_rule = Evaluator(setup, episodes=EPISODES, seed=0, rule=Rule(runs_on=0.5, replace_reference=True))
+    longer = np.asarray(other_rule.start().horizon) - np.asarray(plain.start().horizon)
     np.testing.assert_array_equal(longer, 25 * (plain.clip == library.names.index("turn")))
-    one, other = plain.rollout(None), asked.rollout(None)
+    one, other = plain.rollout(None), other_rule.rollout(None)
     target = plain.clip == library.names.index("turn")
     np.testing.assert_array_equal(one.tracking_reward[~target, 0], other.tracking_reward[~target, 0])
     assert (one.tracking_reward[target, 0] != other.tracking_reward[target, 0]).all()

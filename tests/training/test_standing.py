@@ -8,7 +8,7 @@ import pytest
 from forgetmimic_jax.evaluation.metrics import Rollout
 from forgetmimic_jax.motion.library import only_clips
 from forgetmimic_jax.training import standing
-from forgetmimic_jax.training.standing import standing_teacher, upright_when_asked
+from forgetmimic_jax.training.standing import standing_teacher, upright_rate
 
 LENGTH = np.array([*[250] * 19, 249])  # of twenty episodes, one of which ends a step early
 
@@ -38,16 +38,16 @@ def setup(tiny_setup):
     return dataclasses.replace(tiny_setup, config=config, base=object())
 
 
-def test_a_base_is_asked_to_stand_in_the_targets_states(setup, evaluated):
-    assert upright_when_asked(setup, None) == 0.95
+def test_a_base_is_measured_in_the_targets_states_with_the_stand_as_its_reference(setup, evaluated):
+    assert upright_rate(setup, None) == 0.95
     assert (evaluated["setup"].library.names, evaluated["episodes"]) == (("turn",), 20)
-    assert (evaluated["rule"].asked, evaluated["rule"].runs_on) == (True, 3.0)
+    assert (evaluated["rule"].replace_reference, evaluated["rule"].runs_on) == (True, 3.0)
 
 
 def test_a_base_that_stays_upright_is_the_teacher(setup, evaluated, tmp_path, capsys):
     assert standing_teacher(setup, tmp_path / "run") is setup.base
     assert not list(tmp_path.iterdir())
-    said = "asked to stand in the middle of a target, the base stays upright in 95% of the episodes\n"
+    said = "with the stand as the reference, the base stays upright in 95% of the targets' episodes\n"
     assert capsys.readouterr().out == said
 
 
@@ -61,7 +61,11 @@ def test_a_base_that_falls_more_often_learns_it_from_the_targets_states(setup, e
 
     monkeypatch.setattr(standing, "run", run)
     assert standing_teacher(setup, tmp_path / "run") == "taught"
-    assert (started["folder"], started["resume"], started["rule"].asked) == (tmp_path / "run-stand", False, True)
+    assert (started["folder"], started["resume"], started["rule"].replace_reference) == (
+        tmp_path / "run-stand",
+        False,
+        True,
+    )
     config = started["setup"].config
     assert (config.iterations, config.sampling.target_share, config.ppo.base_kl) == (7, 1.0, 0.0)
     assert config.unlearn == setup.config.unlearn

@@ -124,29 +124,29 @@ def test_the_taught_action_sends_the_joint_targets_that_the_teacher_would(
 
 
 @pytest.mark.parametrize("mode", ["residual", "offset"])
-def test_a_robot_that_is_asked_to_stand_lives_as_one_whose_reference_is_the_stand(robot, library, tiny_config, mode):
+def test_a_target_with_the_stand_as_reference_is_an_episode_of_the_stand(robot, library, tiny_config, mode):
     """The same action sends the same joint targets, and state, reward and observation are the same."""
     forgetting = setup_of(robot, library, tiny_config, mode, "wbc132")
     standing = dataclasses.replace(forgetting, library=stand_library(robot, 50))
     action = jnp.asarray(np.random.default_rng(0).standard_normal((1, 29)), jnp.float32)
 
     sent: list[np.ndarray] = []
-    env = dataclasses.replace(puppet(forgetting, *leaning(robot, 1.1, (3.0, -2.0)), sent), asked=True)
+    env = dataclasses.replace(puppet(forgetting, *leaning(robot, 1.1, (3.0, -2.0)), sent), replace_reference=True)
     assets = make_assets(forgetting)
-    after, asked = tracking.step(env, assets, started(env, assets, TURN, FRAME), action, KEY)
+    after, replaced = tracking.step(env, assets, started(env, assets, TURN, FRAME), action, KEY)
     seen = tracking.observe(env, assets, after, None)[0]
 
     of_stand, assets = puppet(standing, *leaning(robot, 0.0, (0.0, 0.0)), sent), make_assets(standing)
     there, plain = tracking.step(of_stand, assets, started(of_stand, assets, 0, 0), action, KEY)
     np.testing.assert_allclose(sent[0], sent[1], atol=1e-6)
-    np.testing.assert_allclose(asked.reward.normalized_tracking, plain.reward.normalized_tracking, atol=1e-5)
+    np.testing.assert_allclose(replaced.reward.normalized_tracking, plain.reward.normalized_tracking, atol=1e-5)
     np.testing.assert_allclose(seen, tracking.observe(of_stand, assets, there, None)[0], atol=2e-5)
 
 
-def test_a_robot_at_a_kept_clip_is_asked_for_that(robot, library, tiny_config):
+def test_a_kept_clip_keeps_its_reference(robot, library, tiny_config):
     setup = setup_of(robot, library, tiny_config, "residual", "root132")
-    env, assets = dataclasses.replace(puppet(setup, None, None, []), asked=True), make_assets(setup)
-    following = tracking.to_follow(env, assets, started(env, assets, SWAY, FRAME), ahead=1)
+    env, assets = dataclasses.replace(puppet(setup, None, None, []), replace_reference=True), make_assets(setup)
+    following = tracking.reference_of(env, assets, started(env, assets, SWAY, FRAME), ahead=1)
     np.testing.assert_array_equal(following.joint_pos[0], library.clip(SWAY).joint_pos[FRAME + 1])
 
 
