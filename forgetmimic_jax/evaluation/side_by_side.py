@@ -24,9 +24,8 @@ from forgetmimic_jax.robot.model import Robot
 from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.tracking.env import Assets, Environment, EnvState, StepResult
 from forgetmimic_jax.tracking.reference import align_to_anchor
-from forgetmimic_jax.tracking.reward import Pair
 from forgetmimic_jax.tracking.setup import Setup
-from forgetmimic_jax.tracking.stand import low, stand_frame, tilted
+from forgetmimic_jax.tracking.stand import low, stand_frame, tilted_unlike_clip
 
 
 @struct.dataclass
@@ -109,7 +108,7 @@ def happened(robot: Robot, stand: Frames, result: StepResult) -> Happened:
     stand_there = align_to_anchor(stands, robot.anchor, clip.pos[:, robot.anchor], clip.quat[:, robot.anchor])
     outside = (joint_pos < robot.arrays.soft_lower) | (joint_pos > robot.arrays.soft_upper)
     return Happened(
-        fallen=fallen_unlike_clip(robot, pair) | result.diverged,
+        fallen=low(robot, bodies) | tilted_unlike_clip(robot, bodies, clip) | result.diverged,
         impact=bodies.impact_force / robot.weight,
         impact_speed=bodies.impact_speed,
         head_contact=bodies.head_contact > 0,
@@ -125,14 +124,6 @@ def happened(robot: Robot, stand: Frames, result: StepResult) -> Happened:
 def squared_distance(one: Array, other: Array) -> Array:
     """Mean over key bodies [env, key_body, 3] of the squared distance [env] m²; one is at the other's anchor."""
     return ((one - other) ** 2).sum(-1).mean(-1)
-
-
-def fallen_unlike_clip(robot: Robot, pair: Pair) -> Array:
-    """bool[env]: the robot is low, or it is tilted where the clip is not.
-
-    A cartwheel or a high kick tilts the anchor by more than 60 degrees itself, which is no fall.
-    """
-    return low(robot, pair.bodies) | (tilted(robot, pair.bodies) & ~tilted(robot, pair.reference.bodies))
 
 
 def push(state: EnvState, velocity: Sequence[float] | np.ndarray) -> EnvState:

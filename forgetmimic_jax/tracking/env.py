@@ -285,7 +285,8 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
     if env.runs_on:
         is_target = assets.is_target[state.clip]
         causes = {name: broken & ~is_target for name, broken in causes.items()}
-        causes["fall"] = is_target & falls(robot, state.bodies, bodies)
+        clip_before, clip_after = (lookup(assets.library, state.clip, state.frame + ahead).bodies for ahead in (0, 1))
+        causes["fall"] = is_target & falls(robot, state.bodies, bodies, clip_before, clip_after)
     terminated = diverged | jnp.stack(list(causes.values())).any(0)
     steps = state.step + 1
     new = dataclasses.replace(

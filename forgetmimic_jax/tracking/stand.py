@@ -53,10 +53,24 @@ def tilted(robot: Robot, bodies: Bodies) -> Array:
     return up[:, 2] < np.cos(FALL_TILT)
 
 
-def falls(robot: Robot, before: Bodies, after: Bodies) -> Array:
-    """bool[env]: the robot is low or tilted after a step, and was not so before it; arguments as in `low`.
+def tilted_unlike_clip(robot: Robot, bodies: Bodies, clip: Bodies) -> Array:
+    """bool[env]: the anchor is tilted by more than 60 degrees and the clip's is not.
+
+    A cartwheel or a high kick tilts the anchor itself, which is no fall.
+
+    Args:
+        robot: whose bodies they are.
+        bodies: [env, key_body] the robot's.
+        clip: [env, key_body] those of the clip's frame.
+    """
+    return tilted(robot, bodies) & ~tilted(robot, clip)
+
+
+def falls(robot: Robot, before: Bodies, after: Bodies, clip_before: Bodies, clip_after: Bodies) -> Array:
+    """bool[env]: the robot is low, or tilted unlike the clip, after a step and was not so before it.
 
     So a robot that lies at the start of a clip of getting up does not fall, and one that leans in the middle of a kick
-    falls when it is low.
+    falls when it is low, or when the clip leans no longer. Arguments as in `tilted_unlike_clip`.
     """
-    return (low(robot, after) & ~low(robot, before)) | (tilted(robot, after) & ~tilted(robot, before))
+    tilts = tilted_unlike_clip(robot, after, clip_after) & ~tilted_unlike_clip(robot, before, clip_before)
+    return (low(robot, after) & ~low(robot, before)) | tilts

@@ -26,7 +26,14 @@ ENOUGH = 0.95  # upright rate of a base that needs no training
 # PPO; the reference of a target clip is the stand, and only a fall terminates an episode.
 STANDING = Rule(runs_on=HOLD_SECONDS, replace_reference=True)
 # The teacher needs no clip any more, so it has no KL to the base.
-LEARNING: dict[str, Any] = {"minibatches": 4, "epochs": 4, "base_kl": 0.0, "equal_clips": False}
+LEARNING: dict[str, Any] = {
+    "minibatches": 4,
+    "epochs": 4,
+    "learning_rate": 3e-4,
+    "base_kl": 0.0,
+    "equal_clips": False,
+}
+SECONDS = 2.0  # an episode: a robot that falls does so early, and short episodes have more starts
 
 
 def upright_rate(setup: Setup, policy: Policy) -> float:
@@ -73,7 +80,7 @@ def standing_teacher(setup: Setup, directory: Path) -> Policy:
 
 
 def _learning(setup: Setup) -> Setup:
-    """The setup of the training: all starts are those of the targets."""
+    """The setup of the training: all starts are in the targets, more of them where the robot falls."""
     config = setup.config
     return dataclasses.replace(
         setup,
@@ -81,6 +88,7 @@ def _learning(setup: Setup) -> Setup:
             config,
             iterations=round(config.unlearn.settings["stand_iterations"]),
             ppo=dataclasses.replace(config.ppo, **LEARNING),
-            sampling=dataclasses.replace(config.sampling, clips="all", target_share=1.0),
+            sampling=dataclasses.replace(config.sampling, rule="adaptive", clips="all", target_share=1.0),
+            max_episode_steps=round(SECONDS / config.physics.control_step),
         ),
     )

@@ -1,9 +1,10 @@
 """The stop rule of unlearning: a run ends when the targets' skill is at the zero-action baseline.
 
 Every `unlearn.stop_every` iterations the targets are evaluated on a few episodes. From the second evaluation in a row
-whose skill is at the baseline the step size falls to 0 over SETTLE iterations, and the run ends. More training would
-push the targets below the baseline, which is over-unlearning (Shi et al. 2024, "MUSE"). What the rule has seen is in
-every checkpoint, so a run that is resumed ends where it would have.
+whose skill is at the baseline the run settles: over SETTLE iterations the step size falls to 0 and the KL to the base
+holds the kept clips more strongly. Then it ends. More training would push the targets below the baseline, which is
+over-unlearning (Shi et al. 2024, "MUSE"). What the rule has seen is in every checkpoint, so a run that is resumed ends
+where it would have.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from forgetmimic_jax.evaluation.rollout import Evaluator
 from forgetmimic_jax.motion.library import only_clips
 from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.tracking.env import Environment
+from forgetmimic_jax.tracking.focus import focus_of
 from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.training.checkpoint import CheckpointInfo
 from forgetmimic_jax.training.course import Plain, Position
@@ -30,6 +32,7 @@ from forgetmimic_jax.training.devices import agreed
 AT_BASELINE = 0.1  # skill up to which the targets are at the zero-action baseline
 IN_A_ROW = 2
 SETTLE = 60  # iterations
+KEEP = 4.0  # factor on the weight of the KL to the base while a run settles: the kept clips come back
 EPISODES = 10  # a target clip
 
 
@@ -110,8 +113,10 @@ class Stopping(Plain):
         return self._with_step_size(position)
 
     def _with_step_size(self, position: Position) -> Position:
-        """With the share of the step size that the next iteration takes."""
+        """With the share of the step size and the KL to the base that the next iteration takes."""
         self._iteration, start = position.iteration, settles_from(self._skills)
+        usual = focus_of(self._setup.config.ppo, position.assets.is_target)
         share = 1.0 if start is None else 1.0 - (position.iteration - start) / SETTLE
-        focus = dataclasses.replace(position.assets.focus, settle=jnp.float32(share))
+        base_kl = usual.base_kl if usual.base_kl is None or start is None else KEEP * usual.base_kl
+        focus = dataclasses.replace(position.assets.focus, settle=jnp.float32(share), base_kl=base_kl)
         return dataclasses.replace(position, assets=dataclasses.replace(position.assets, focus=focus))

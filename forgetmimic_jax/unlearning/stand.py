@@ -67,8 +67,9 @@ def regression(config: Config, batch: Batch, now: Prediction, iteration: Array) 
     return loss, metrics | {"teacher_kl": learn, "base_kl": keep}
 
 
-# A regression: the number of gradient steps decides, and a rollout serves many of them.
-PACE = Pace({"cpu": 140, "paper": 400}, {"cpu": {**SHORT, "branches": 1, "minibatches": 12, "epochs": 4}}, {"cpu": 0.5})
+# A regression: the number of gradient steps decides, they may be large, and a rollout serves many of them.
+SHORT_REGRESSION = {**SHORT, "branches": 1, "minibatches": 12, "epochs": 4, "learning_rate": 1.5e-3}
+PACE = Pace({"cpu": 140, "paper": 400}, {"cpu": SHORT_REGRESSION}, {"cpu": 0.5})
 METHOD = Method(
     loss=regression,
     teach=taught_action,

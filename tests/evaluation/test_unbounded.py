@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from forgetmimic_jax.evaluation import tables
 from forgetmimic_jax.evaluation.document import EvaluationDocument, read_evaluation, write_evaluation
-from forgetmimic_jax.evaluation.side_by_side import Happened, fallen_unlike_clip, happened
+from forgetmimic_jax.evaluation.side_by_side import Happened, happened
 from forgetmimic_jax.evaluation.statistics import bootstrap_quantile, resampling_weights
 from forgetmimic_jax.evaluation.summary import evaluate_policies
 from forgetmimic_jax.evaluation.unbounded import UnboundedRollout, add_numbers, episode_numbers, roll_out
@@ -194,7 +194,7 @@ def test_a_tilt_that_the_clip_has_too_is_no_fall_but_a_low_root_is(robot, frames
 
     def fell(bodies: Bodies, clip: Bodies) -> bool:
         reference = dataclasses.replace(frames, bodies=clip)
-        return bool(fallen_unlike_clip(robot, step_result(robot, reference, bodies).pair)[0])
+        return bool(happened(robot, stand_frame(robot), step_result(robot, reference, bodies)).fallen[0])
 
     assert [fell(upright, upright), fell(tilted, upright), fell(tilted, tilted)] == [False, True, False]
     assert float(low.pos[0, robot.root, 2]) < 0.38

@@ -96,6 +96,27 @@ def test_a_robot_that_leans_already_falls_when_it_is_low(setup):
     np.testing.assert_array_equal(stepped(setup, both, before=leaning).causes["fall"], [False, True])
 
 
+@pytest.fixture
+def leaning_clip(setup) -> Setup:
+    """The clip `turn` leans by 70 degrees in its frames 10 and 11."""
+    frames, start = setup.library.frames, int(setup.library.start[TURN])
+    leaning = tilted(setup.robot.anchor, 70.0)(frames.bodies)
+    there = jnp.zeros(len(frames.joint_pos), bool).at[jnp.array([start + 10, start + 11])].set(True)
+    quat = jnp.where(there[:, None, None], leaning.quat, frames.bodies.quat)
+    bodies = dataclasses.replace(frames.bodies, quat=quat)
+    library = dataclasses.replace(setup.library, frames=dataclasses.replace(frames, bodies=bodies))
+    return dataclasses.replace(setup, library=library)
+
+
+def test_a_robot_that_leans_with_the_clip_falls_when_the_clip_leans_no_longer(leaning_clip):
+    def falls(frame: int, degrees: float) -> bool:
+        leaning = tilted(leaning_clip.robot.anchor, degrees)
+        before = leaning if frame > 9 else None  # upright, as the clip is
+        return bool(stepped(leaning_clip, leaning, frame=frame, before=before).causes["fall"][TURN])
+
+    assert [falls(9, 70.0), falls(10, 70.0), falls(11, 70.0), falls(11, 58.0)] == [False, False, True, False]
+
+
 def test_a_robot_that_comes_apart_is_still_terminated(setup):
     result = stepped(setup, low(setup.robot.root, np.nan))
     np.testing.assert_array_equal(result.diverged, [True, True])

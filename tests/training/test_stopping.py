@@ -33,7 +33,8 @@ def test_a_run_settles_from_the_second_look_in_a_row_at_the_baseline(curve, expe
 def course(tiny_setup, monkeypatch, tmp_path):
     """A course of `turn`, looked at every 5 iterations, whose skill at iteration i is `curve[i]`."""
     unlearn = UnlearnConfig(("turn",), settings={"penalty": 16.0}, stop_every=5)
-    config = dataclasses.replace(tiny_setup.config, iterations=100, evaluate_every=0, unlearn=unlearn)
+    ppo = dataclasses.replace(tiny_setup.config.ppo, base_kl=0.1)
+    config = dataclasses.replace(tiny_setup.config, iterations=100, evaluate_every=0, unlearn=unlearn, ppo=ppo)
     setup = dataclasses.replace(tiny_setup, config=config)
     looks = []
 
@@ -47,22 +48,23 @@ def course(tiny_setup, monkeypatch, tmp_path):
 
     monkeypatch.setattr(stopping, "Targets", Targets)
 
-    def course(resumed=None) -> Stopping:
+    def course(resumed=None, setup=setup) -> Stopping:
         return Stopping(setup, None, tmp_path, Console(), resumed)
 
-    course.assets, course.looks = make_assets(setup), looks
+    course.assets, course.looks, course.setup = make_assets(setup), looks, setup
     return course
 
 
-def through(course: Stopping, assets, start: int, end: int) -> tuple[list[float], int]:
-    """The share of the step size of every iteration from `start`, and the iteration after which the run ends."""
+def through(course: Stopping, assets, start: int, end: int) -> tuple[list[tuple[float, ...]], int]:
+    """Share of the step size and KL weights of the two clips, of every iteration from `start`; and the last one."""
     state = SimpleNamespace(policy=start)
     position = course.begin(Position(state, assets, start, 0))
     shares = []
     for iteration in range(start + 1, end + 1):
         if course.finished:
             break
-        shares.append(float(position.assets.focus.settle))
+        focus = position.assets.focus
+        shares.append((float(focus.settle), *focus.base_kl.tolist()))
         state = SimpleNamespace(policy=iteration)  # a policy that the stand-in for the evaluation knows by its number
         position = course.after(dataclasses.replace(position, state=state, iteration=iteration))
     return shares, position.iteration
@@ -72,7 +74,19 @@ def test_the_step_size_falls_to_nothing_over_sixty_iterations_and_the_run_ends(c
     shares, end = through(course(), course.assets, 0, 100)
     assert end == 75  # 15 and 60
     assert course.looks == [5, 10, 15]  # at the baseline at 10 and 15
-    assert shares == pytest.approx([1.0] * 15 + [1.0 - i / 60 for i in range(60)])
+    step_size, on_kept, on_target = zip(*shares, strict=True)
+    assert step_size == pytest.approx([1.0] * 15 + [1.0 - i / 60 for i in range(60)])
+    assert on_kept == pytest.approx([0.1] * 15 + [0.4] * 60)
+    assert set(on_target) == {0.0}
+
+
+def test_a_run_without_a_kl_to_the_base_settles_without_one(course):
+    setup = course.setup
+    without = dataclasses.replace(setup.config, ppo=dataclasses.replace(setup.config.ppo, base_kl=0.0))
+    resumed = SimpleNamespace(curriculum={"skills": [(5, 0.0), (10, 0.0)]})
+    settling = course(resumed, dataclasses.replace(setup, config=without))
+    focus = settling.begin(Position(SimpleNamespace(policy=20), course.assets, 20, 0)).assets.focus
+    assert (float(focus.settle), focus.base_kl) == (pytest.approx(1.0 - 10 / 60), None)
 
 
 @pytest.mark.parametrize("stopped", [7, 10, 12, 15, 22, 75])
