@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from forgetmimic_jax import train
 from forgetmimic_jax.basics.errors import InputError, run_command
-from forgetmimic_jax.settings.config import Config, EngineName, Preset, UnlearnConfig
+from forgetmimic_jax.settings.config import Config, UnlearnConfig
 from forgetmimic_jax.settings.options import (
     Settings,
     check_same,
@@ -33,7 +34,7 @@ EPISODES = 20  # a clip in an evaluation
 
 
 @dataclass
-class Options:
+class Options(train.Options):
     """Train one policy on every clip of a library, in phases.
 
     First it trains on all clips, then mostly on those that lag. A clip that is stuck gets a specialist, and all
@@ -41,32 +42,18 @@ class Options:
     continues, and the policy is the same to the last bit.
     """
 
-    robot: str = "g1"
-    """Robot under robots/."""
-    preset: Preset = "cpu"
-    """Settings to start from: cpu for a laptop, paper for a GPU."""
     iterations: int | None = None
     """PPO iterations at most; cpu: 7200 (88 million steps), paper: 30000."""
-    seed: int | None = None
-    """Random seed; 0 by default."""
-    physics: EngineName | None = None
-    """Physics engine; auto is native on a CPU and mjx on a GPU or TPU."""
-    devices: int | None = None
-    """Devices that share the environments: GPUs, or on a CPU parts of its cores; 1 by default (docs/cluster.md)."""
-    library: Path | None = None
-    """Folder of clips; data/ROBOT by default."""
     base: Path | None = None
     """Checkpoint whose policy to start from, another robot's too; none: a random policy. By default the shipped base
     for a library of your own, and a random policy for the shipped library."""
+    output: Path | None = None
+    """Folder of the run; runs/pretrain-ROBOT by default, or with --without runs/pretrain-ROBOT-control."""
+    set: Settings = field(default_factory=list)
+    """Any other settings, such as pretrain.patience=5."""
     without: str | None = None
     """Clips to leave out, comma-separated: from a random policy, without an episode of these clips. The result is the
     retrained control of a run that forgets them (evidence, report and the studies: --control)."""
-    output: Path | None = None
-    """Folder of the run; runs/pretrain-ROBOT by default, or with --without runs/pretrain-ROBOT-control."""
-    resume: bool = False
-    """Continue from the newest checkpoint in the output folder, with the settings saved there."""
-    set: Settings = field(default_factory=list)
-    """Any other settings, such as pretrain.patience=5."""
 
 
 def main(options: Options) -> None:
