@@ -76,7 +76,9 @@ def attack_config(config: Config) -> Config:
         base=None,
         evaluate_every=0,
         unlearn=UnlearnConfig(),
-        sampling=dataclasses.replace(config.sampling, rule="uniform_clips", clips="all", target_share=0.0),
+        sampling=dataclasses.replace(
+            config.sampling, rule="uniform_clips", clips="all", target_share=0.0, first_frame=0.0
+        ),
         wrench=dataclasses.replace(config.wrench, max_gain=0.0),
         ppo=dataclasses.replace(config.ppo, **{**pace, "base_kl": 0.0}),
     )

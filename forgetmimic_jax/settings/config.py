@@ -147,6 +147,7 @@ class SamplingConfig:
     failure_signal: Literal["survival_weighted", "alive_mean"] = "survival_weighted"
     clips: Literal["all", "kept"] = "all"  # kept: no episode of a clip to forget
     target_share: Share = 0.0  # share of the starts that are the targets'; 0: what the rule gives them
+    first_frame: Share = 0.0  # share of the starts that are moved to the first frame of their clip
 
 
 @dataclass(frozen=True)

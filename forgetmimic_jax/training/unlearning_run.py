@@ -107,7 +107,8 @@ def config_of_new_run(options: Options) -> Config:
     config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, **pace.ppo.get(config.preset, {})))
     sampling = replace_given(config.sampling, rule=options.sampler, clips=options.clips)
     if (sampling.rule, sampling.clips) == ("uniform_clips", "all"):  # the other samplers' shares are their own
-        sampling = dataclasses.replace(sampling, target_share=pace.target_share.get(config.preset, 0.0))
+        share = pace.target_share.get(config.preset, 0.0)
+        sampling = dataclasses.replace(sampling, target_share=share, first_frame=pace.first_frame)
     wrench = config.wrench
     if options.wrench:
         wrench = dataclasses.replace(wrench, max_gain=info.config.wrench.max_gain or WrenchConfig.max_gain)

@@ -17,11 +17,13 @@ class Pace:
         iterations: by preset; of a preset without a number, as many steps as the base was trained for.
         ppo: settings of the `ppo` section by preset, in the place of the base's own.
         target_share: share of the uniform starts that are the targets', by preset.
+        first_frame: share of the uniform starts that are at the first frame of their clip.
     """
 
     iterations: Mapping[str, int]
     ppo: Mapping[str, Mapping[str, Any]]
     target_share: Mapping[str, float] = field(default_factory=dict)
+    first_frame: float = 0.0
 
 
 # On a laptop: short iterations, because forgetting takes some hundred of them whatever their length. Targets would be

@@ -56,7 +56,7 @@ def unlearning_config(base: Config, unlearn: UnlearnConfig) -> Config:
     sampling = dataclasses.replace(base.sampling, clips=method.clips, target_share=0.0)  # which a base may have had
     wrench = base.wrench
     if method.start != "fresh":
-        sampling = dataclasses.replace(sampling, rule="uniform_clips")
+        sampling = dataclasses.replace(sampling, rule="uniform_clips", first_frame=0.0)
         wrench = dataclasses.replace(wrench, max_gain=0.0)
     return dataclasses.replace(base, unlearn=unlearn, sampling=sampling, wrench=wrench)
 

@@ -21,6 +21,7 @@ from forgetmimic_jax.settings.config import load_config, validate
 from forgetmimic_jax.tracking.setup import make_setup
 from forgetmimic_jax.training import checkpoint, comparison, run, start, stopping
 from forgetmimic_jax.training.unlearning_run import config_of_new_run
+from forgetmimic_jax.unlearning.stand import PACE
 
 
 @pytest.fixture
@@ -344,7 +345,7 @@ def test_flags_choose_the_sampler_and_the_wrench(options):
 def test_targets_get_a_share_of_the_uniform_starts_at_the_laptops_pace(options, unlearned_run, given, share):
     for base in ({}, {"base": unlearned_run.checkpoint(2)}):  # whose own training had the share
         config = config_of_new_run(options(**given, **base))
-        assert config.sampling.target_share == share
+        assert (config.sampling.target_share, config.sampling.first_frame) == (share, 0.0)
         validate(config)
 
 
@@ -482,8 +483,10 @@ def test_a_base_that_cannot_stand_learns_that_first_and_then_teaches(options, tm
     assert re.search(r"^after training it stays upright in \d+%$", printed, re.M)
     learned = checkpoint.read_info(tmp_path / "run-stand" / "checkpoints" / "00000002")
     assert (learned.config.sampling.target_share, learned.config.unlearn.method) == (1.0, "stand")
+    assert (learned.config.sampling.first_frame, learned.config.sampling.rule) == (PACE.first_frame, "adaptive")
     config = load_config(tmp_path / "run" / "config.yaml")
     assert (config.unlearn.instead, config.sampling.target_share, config.unlearn.stop_every) == ("stand", 0.5, 0)
+    assert config.sampling.first_frame == PACE.first_frame > 0.0
     rows = read_rows(tmp_path / "run" / "metrics.jsonl")
     assert all(np.isfinite(row[name]) and row[name] > 0.0 for row in rows for name in ("teacher_kl", "base_kl"))
     policies = json.loads((tmp_path / "run" / "evaluation.json").read_text())["policies"]

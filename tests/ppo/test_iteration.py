@@ -267,6 +267,7 @@ def many(robot, library, tiny_config) -> Run:
     return Run(Environment(config, robot, Collapsing(), 256, noisy=False), assets)
 
 
+TURN_STARTS = 40  # frames of the target that an episode may start at
 FOUR_ERRORS = 4 * np.sqrt(0.8 * 0.2)  # over √n: four standard errors of the share of n starts
 
 
@@ -276,6 +277,26 @@ def test_the_targets_get_their_share_of_the_starts_in_a_rollout(many):
     first, later = found.clip[0] == TURN, found.clip[1:] == TURN
     assert first.mean() == pytest.approx(0.8, abs=FOUR_ERRORS / np.sqrt(first.size))
     assert later.mean() == pytest.approx(0.8, abs=FOUR_ERRORS / np.sqrt(later.size))
+
+
+def from_first_frames(run: Run, share: float) -> Run:
+    """The run with that share of its starts at the first frame of their clip."""
+    sampling = dataclasses.replace(run.env.config.sampling, first_frame=share)
+    config = dataclasses.replace(run.env.config, sampling=sampling)
+    return Run(dataclasses.replace(run.env, config=config), run.assets)
+
+
+def test_a_share_of_the_starts_is_at_the_first_frame(many):
+    frame = np.asarray(from_first_frames(many, 0.8).begin().env.frame)
+    assert (frame == 0).mean() == pytest.approx(0.8, abs=FOUR_ERRORS / np.sqrt(frame.size) + 1.0 / TURN_STARTS)
+    assert (np.asarray(many.begin().env.frame) == 0).mean() < 0.2
+
+
+def test_states_drawn_without_a_simulator_may_all_be_at_the_first_frame(many):
+    first = from_first_frames(many, 1.0)
+    found = jax.jit(lambda assets, state: drawn(first.env, assets, state))(first.assets, first.begin())
+    reference = np.asarray(found["actor_observation"])[..., :39].reshape(found["clip"].size, -1)
+    assert len(np.unique(reference, axis=0)) == 2  # one frame a clip
 
 
 def test_states_drawn_without_a_simulator_have_the_share_too_and_each_its_own_reset_noise(many):

@@ -124,6 +124,21 @@ def test_uniform_clips_gives_every_clip_the_same_and_every_frame_of_a_clip_the_s
         assert stats.chisquare(counts).pvalue > 1e-3
 
 
+def test_a_share_of_the_starts_is_at_the_first_frame_of_the_same_clips():
+    bins = bins_of([31, 72, 5], 10)
+    probabilities = bin_probabilities(SamplingConfig(), bins, jnp.ones(bins.valid.shape))
+    plain, moved = (
+        [np.asarray(x) for x in sample_start(jax.random.PRNGKey(3), probabilities, bins, DRAWS, share)]
+        for share in (0.0, 0.3)
+    )
+    np.testing.assert_array_equal(moved[0], plain[0])
+    first = (moved[1] == 0) & (moved[2] == 0)
+    np.testing.assert_array_equal(moved[1][~first], plain[1][~first])
+    np.testing.assert_array_equal(moved[2][~first], plain[2][~first])
+    others = plain[2] > 0
+    assert stats.binomtest(int(first[others].sum()), int(others.sum()), 0.3).pvalue > 1e-3
+
+
 def test_starts_follow_the_probabilities_and_lie_in_their_bin():
     bins = bins_of([31, 72, 5], 10)
     level = jax.random.uniform(jax.random.PRNGKey(2), bins.valid.shape)
