@@ -14,7 +14,7 @@
 ##              experiments every data/ROBOT/base*)
 ## CONTROLS     retrained controls for the experiments, comma-separated (default: every data/ROBOT/control*)
 ## WITHOUT      clips that pretrain leaves out, comma-separated, which makes a retrained control (default: none)
-## CHECKPOINT   the policy to evaluate, export, play or film (default: the shipped base)
+## CHECKPOINT   the policy to evaluate, export, play or film (default: the shipped base; to play or film, all shipped)
 ## BESIDE       more checkpoints to play or film beside it, comma-separated
 ## RUN          folder of the run to attack, or to report on
 ## OUTPUT       where the results go (default: under runs/)

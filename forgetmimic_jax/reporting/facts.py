@@ -15,7 +15,9 @@ from forgetmimic_jax.evaluation.relearning import Lasted
 from forgetmimic_jax.evaluation.tables import number, percent
 from forgetmimic_jax.evaluation.verdict import NotMeasured
 from forgetmimic_jax.reporting.subject import Subject
+from forgetmimic_jax.settings.config import SamplingConfig
 from forgetmimic_jax.training.checkpoint import policy_hash
+from forgetmimic_jax.training.stopping import KEEP
 
 PACKAGES = ("forgetmimic-jax", "jax", "mujoco", "numpy", "flax", "optax")
 
@@ -36,6 +38,7 @@ def done(subject: Subject) -> dict[str, str]:
     module = importlib.import_module(f"{unlearning.__name__}.{config.unlearn.method}")
     facts = {"Method": f"{config.unlearn.method}: {str(module.__doc__).splitlines()[0]}"}
     facts |= {name.capitalize(): f"{value:g}" for name, value in config.unlearn.settings.items()}
+    settles = f"; {KEEP:g} times that while the run settles" if config.unlearn.stop_every else ""
     steps = document.budget.get(UNLEARNED, {}).get("environment_steps", subject.info.environment_steps)
     return facts | {
         "Budget": f"{subject.info.iteration:,} iterations, {steps:,.0f} environment steps, {config.ppo.num_envs} "
@@ -43,10 +46,10 @@ def done(subject: Subject) -> dict[str, str]:
         "Base's training": f"{base.environment_steps:,} environment steps"
         if base.environment_steps
         else "unknown: an imported policy",
-        "Sampler": f"{config.sampling.rule.replace('_', ' ')}, starts from {config.sampling.clips} clips",
+        "Sampler": _sampler(config.sampling),
         "Assistive wrench": f"up to {config.wrench.max_gain:g}" if config.wrench.max_gain else "off",
         "Weights in PPO's losses": "the same for every clip" if config.ppo.equal_clips else "the same for every step",
-        "KL to the base": f"weight {config.ppo.base_kl:g}, on kept clips"
+        "KL to the base": f"weight {config.ppo.base_kl:g}, on kept clips{settles}"
         if subject.rows and "base_kl" in subject.rows[-1]  # some methods' losses have none
         else "off",
         "Step size": f"{config.ppo.learning_rate:g}, {config.ppo.schedule}",
@@ -54,6 +57,13 @@ def done(subject: Subject) -> dict[str, str]:
         "Evaluation": f"{document.episodes} episodes a clip with deterministic actions, without assistance and "
         f"randomisation, and with the same starts for every policy",
     }
+
+
+def _sampler(sampling: SamplingConfig) -> str:
+    """Which starts episodes have."""
+    shares = {"on the targets": sampling.target_share, "at the first frame of a clip": sampling.first_frame}
+    told = [f"{share:.0%} {where}" for where, share in shares.items() if share]
+    return ", ".join([sampling.rule.replace("_", " "), f"starts from {sampling.clips} clips", *told])
 
 
 def cards(subject: Subject) -> list[dict[str, str]]:

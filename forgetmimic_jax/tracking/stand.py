@@ -67,10 +67,11 @@ def tilted_unlike_clip(robot: Robot, bodies: Bodies, clip: Bodies) -> Array:
 
 
 def falls(robot: Robot, before: Bodies, after: Bodies, clip_before: Bodies, clip_after: Bodies) -> Array:
-    """bool[env]: the robot is low, or tilted unlike the clip, after a step and was not so before it.
+    """bool[env]: a robot that was not low before a step is low after it, or begins to be tilted unlike the clip.
 
-    So a robot that lies at the start of a clip of getting up does not fall, and one that leans in the middle of a kick
-    falls when it is low, or when the clip leans no longer. Arguments as in `tilted_unlike_clip`.
+    A robot that lies does not fall, also where the clip gets up. One that leans in the middle of a kick falls when it
+    is low, or when the clip no longer leans. Arguments as in `tilted_unlike_clip`.
     """
+    stood = ~low(robot, before)
     tilts = tilted_unlike_clip(robot, after, clip_after) & ~tilted_unlike_clip(robot, before, clip_before)
-    return (low(robot, after) & ~low(robot, before)) | tilts
+    return stood & (low(robot, after) | tilts)

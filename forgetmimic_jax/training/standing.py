@@ -20,6 +20,7 @@ from forgetmimic_jax.tracking.stand import STAND
 from forgetmimic_jax.training.checkpoint import CONFIG, newest_checkpoint
 from forgetmimic_jax.training.devices import agreed
 from forgetmimic_jax.training.run import run
+from forgetmimic_jax.unlearning.stand import PACE
 
 EPISODES = 20  # a target
 ENOUGH = 0.95  # upright rate of a base that needs no training
@@ -80,7 +81,7 @@ def standing_teacher(setup: Setup, directory: Path) -> Policy:
 
 
 def _learning(setup: Setup) -> Setup:
-    """The setup of the training: all starts are in the targets, more of them where the robot falls."""
+    """The setup of the training: all starts are in the targets, more of them at the first frame and where it fails."""
     config = setup.config
     return dataclasses.replace(
         setup,
@@ -88,7 +89,9 @@ def _learning(setup: Setup) -> Setup:
             config,
             iterations=round(config.unlearn.settings["stand_iterations"]),
             ppo=dataclasses.replace(config.ppo, **LEARNING),
-            sampling=dataclasses.replace(config.sampling, rule="adaptive", clips="all", target_share=1.0),
-            max_episode_steps=round(SECONDS / config.physics.control_step),
+            sampling=dataclasses.replace(
+                config.sampling, rule="adaptive", clips="all", target_share=1.0, first_frame=PACE.first_frame
+            ),
+            max_episode_steps=min(config.max_episode_steps, round(SECONDS / config.physics.control_step)),
         ),
     )

@@ -49,7 +49,8 @@ def shipped_policies(robot: str, kind: str) -> tuple[Path, ...]:
     Args:
         robot: whose policies they are.
         kind: `base`, of which data/ROBOT/base is the one that commands take by default, and base-1, base-2, ... are
-            others like it; `control`: retrained controls, the first of them beside the first base.
+            others like it; `control`: retrained controls, the first of them beside the first base; `unlearned`: what
+            methods made of the first base.
     """
     return tuple(sorted(path for path in (DATA_DIR / robot).glob(f"{kind}*") if path.is_dir()))
 

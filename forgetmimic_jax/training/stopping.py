@@ -22,8 +22,7 @@ from forgetmimic_jax.evaluation import metrics
 from forgetmimic_jax.evaluation.rollout import Evaluator
 from forgetmimic_jax.motion.library import only_clips
 from forgetmimic_jax.policy.policy import Policy
-from forgetmimic_jax.tracking.env import Environment
-from forgetmimic_jax.tracking.focus import focus_of
+from forgetmimic_jax.tracking.env import Environment, make_assets
 from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.training.checkpoint import CheckpointInfo
 from forgetmimic_jax.training.course import Plain, Position
@@ -32,7 +31,7 @@ from forgetmimic_jax.training.devices import agreed
 AT_BASELINE = 0.1  # skill up to which the targets are at the zero-action baseline
 IN_A_ROW = 2
 SETTLE = 60  # iterations
-KEEP = 4.0  # factor on the weight of the KL to the base while a run settles: the kept clips come back
+KEEP = 4.0  # factor on the weight of the KL to the base while a run settles, so that the kept clips recover
 EPISODES = 10  # a target clip
 
 
@@ -80,6 +79,7 @@ class Stopping(Plain):
         if resumed is not None and resumed.curriculum is not None:
             self._skills = [(int(iteration), float(skill)) for iteration, skill in resumed.curriculum["skills"]]
         self._targets: Targets | None = None
+        self._base_kl = make_assets(setup).focus.base_kl
         self._iteration = 0
 
     @property
@@ -115,8 +115,7 @@ class Stopping(Plain):
     def _with_step_size(self, position: Position) -> Position:
         """With the share of the step size and the KL to the base that the next iteration takes."""
         self._iteration, start = position.iteration, settles_from(self._skills)
-        usual = focus_of(self._setup.config.ppo, position.assets.is_target)
         share = 1.0 if start is None else 1.0 - (position.iteration - start) / SETTLE
-        base_kl = usual.base_kl if usual.base_kl is None or start is None else KEEP * usual.base_kl
+        base_kl = self._base_kl if self._base_kl is None or start is None else KEEP * self._base_kl
         focus = dataclasses.replace(position.assets.focus, settle=jnp.float32(share), base_kl=base_kl)
         return dataclasses.replace(position, assets=dataclasses.replace(position.assets, focus=focus))

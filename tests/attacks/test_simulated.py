@@ -1,5 +1,7 @@
 """Rollouts and trainings of the attacks in the simulation, in miniature."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -72,7 +74,9 @@ def test_a_fine_tuning_starts_where_it_should_and_leaves_its_start_alone(small_s
 
 
 def test_an_attack_trains_without_anything_that_holds_it_back(small_setup):
-    config = attack_config(small_setup.config)
+    sampling = dataclasses.replace(small_setup.config.sampling, first_frame=0.5)
+    config = attack_config(dataclasses.replace(small_setup.config, sampling=sampling))
+    assert config.sampling.first_frame == 0.0
     assert config.ppo.base_kl == 0.0
     assert config.ppo.schedule == "fixed"
     assert config.wrench.max_gain == 0.0

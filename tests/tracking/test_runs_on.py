@@ -117,6 +117,13 @@ def test_a_robot_that_leans_with_the_clip_falls_when_the_clip_leans_no_longer(le
     assert [falls(9, 70.0), falls(10, 70.0), falls(11, 70.0), falls(11, 58.0)] == [False, False, True, False]
 
 
+def test_a_robot_that_lies_does_not_fall_when_the_clip_gets_up(leaning_clip):
+    def lying(bodies):
+        return low(leaning_clip.robot.root, 0.1)(tilted(leaning_clip.robot.anchor, 70.0)(bodies))
+
+    assert not stepped(leaning_clip, lying, frame=11, before=lying).causes["fall"][TURN]
+
+
 def test_a_robot_that_comes_apart_is_still_terminated(setup):
     result = stepped(setup, low(setup.robot.root, np.nan))
     np.testing.assert_array_equal(result.diverged, [True, True])

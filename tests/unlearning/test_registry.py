@@ -85,6 +85,12 @@ def test_retraining_is_the_base_s_own_training_without_the_targets():
     )
 
 
+def test_only_retraining_starts_at_first_frames_as_the_base_did():
+    base = dataclasses.replace(Config(), sampling=dataclasses.replace(Config().sampling, first_frame=0.3))
+    for method, share in {"retrain": 0.3, "arft": 0.0, "distill": 0.0}.items():
+        assert unlearning_config(base, UnlearnConfig(("punch",), method)).sampling.first_frame == share
+
+
 def test_what_is_taught_instead_is_the_stand_unless_a_clip_is_named():
     def instead(name: str, given: str | None = None) -> str | None:
         return unlearning_config(Config(), UnlearnConfig(("punch",), name, instead=given)).unlearn.instead
