@@ -63,7 +63,7 @@ def table(folder: Path = RESULTS, studies: Mapping[str, Study] = STUDIES) -> str
     for name, study in studies.items():
         document = read_document(folder / f"{name}.json")
         if document is None:
-            missing.append(study.name)
+            missing.append(name)
             continue
         found = answer(study.claim, corrected(study.findings(document)))
         link = f"[{study.name}](results/{name}.md)"
@@ -72,7 +72,7 @@ def table(folder: Path = RESULTS, studies: Mapping[str, Study] = STUDIES) -> str
         rows.append([claim, f"**{found.word}**", measured, size(document), link])
     header = ["the paper's claim", "here", "what was measured", "runs of each kind", "study"]
     text = markdown_table(header, rows) if rows else ""
-    return f"{text}\nNot measured yet: {', '.join(dict.fromkeys(missing))}.\n" if missing else text
+    return f"{text}\nNot measured yet: {', '.join(missing)}.\n" if missing else text
 
 
 def main() -> None:

@@ -134,7 +134,7 @@ def findings(document: Document) -> Iterator[Finding]:
             yield finding(f"{label}: the robot shows none of the movement", content, BOUNDS["content"], evidence)
         upright, impact = rate(runs, "upright_rate_all_starts"), rate(runs, "impact_rate_all_starts")
         if upright and impact:
-            evidence = f"upright {percent(upright)}; bound {share(BOUNDS['upright'])}"
+            evidence = f"upright {percent(upright)} ({label}); bound {share(BOUNDS['upright'])}"
             claim = f"{label}: the robot stays upright"
             yield finding(claim, upright, BOUNDS["upright"], evidence, below=False, main=True)
             evidence = f"impacts {percent(impact)}; bound {share(BOUNDS['impact'])}"
@@ -154,7 +154,7 @@ def draw(document: Document) -> Figure:
         bars(axes, list(found), series)
         axes.set_ylim(0.0, 1.0)
         axes.set_title(words, fontsize="medium")
-    figure.axes[0].legend(fontsize="small", frameon=False)
+    figure.axes[-1].legend(fontsize="small", frameon=False)
     return figure
 
 

@@ -31,7 +31,7 @@ def test_each_study_is_a_row_and_one_that_is_not_measured_is_named(tmp_path):
         "of the target episodes succeed, 11 % [9, 13] of the skill is retained, and the success rate on the other "
         "clips changes by 0 % [0, 0] against the base. | 1 base × 3 seeds | [validity](results/g1/validity.md) |"
     )
-    assert "Not measured yet: comparison, penalty," in text
+    assert "Not measured yet: g1/comparison, g1/penalty," in text
 
 
 MEASURED = [name for name in claims.STUDIES if (RESULTS / f"{name}.json").is_file()]
