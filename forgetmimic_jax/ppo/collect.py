@@ -113,9 +113,7 @@ def draw_states(env: Environment, assets: Assets, state: TrainState) -> tuple[Tr
 
     def one_batch(key: Array) -> Transition:
         start_key, episode_key = jax.random.split(key)
-        clip, start_bin, frame = sample_start(
-            start_key, probabilities, assets.bins, env.num_envs, config.sampling.first_frame
-        )
+        clip, start_bin, frame = sample_start(config.sampling, start_key, probabilities, assets.bins, env.num_envs)
         episodes = tracking.start_episodes(env, assets, episode_key, clip, start_bin, frame, no_gain)
         episodes = tracking.refresh_bodies(env, episodes, jnp.ones((env.num_envs,), bool))
         actor_obs, critic_obs = tracking.observe(env, assets, episodes, None)

@@ -216,8 +216,7 @@ def reset_where(
 ) -> EnvState:
     """New episodes where mask [env], drawn from `probabilities` [clip, bin] with wrench gains [clip, bin]."""
     start_key, episode_key = jax.random.split(key)
-    first_frame = env.config.sampling.first_frame
-    clip, start_bin, frame = sample_start(start_key, probabilities, assets.bins, env.num_envs, first_frame)
+    clip, start_bin, frame = sample_start(env.config.sampling, start_key, probabilities, assets.bins, env.num_envs)
     fresh = start_episodes(env, assets, episode_key, clip, start_bin, frame, gains[clip, start_bin])
     return refresh_bodies(env, _where(mask, fresh, state), mask)
 

@@ -94,9 +94,9 @@ def _by_rule(config: SamplingConfig, bins: Bins, failure_level: Array) -> Array:
 
 
 def sample_start(
-    key: Array, probabilities: Array, bins: Bins, num: int, first_frame: float = 0.0
+    config: SamplingConfig, key: Array, probabilities: Array, bins: Bins, num: int
 ) -> tuple[Array, Array, Array]:
-    """Clip, bin and frame, each i32[num]; the share `first_frame` of them at the first frame of the clip."""
+    """Clip, bin and frame, each i32[num]; the config's share of them at the first frame of the clip."""
     bin_key, frame_key = jax.random.split(key)
     # By the inverse of the cumulative distribution: one uniform number a draw, where Gumbel's trick needs one a bin.
     cumulative = jnp.cumsum(probabilities.reshape(-1))
@@ -104,8 +104,8 @@ def sample_start(
     flat = jnp.searchsorted(cumulative, drawn, side="right")
     clip, index = jnp.divmod(flat, probabilities.shape[1])
     frame = jax.random.randint(frame_key, (num,), bins.start[clip, index], bins.end[clip, index])
-    if first_frame:
-        first = jax.random.bernoulli(jax.random.fold_in(key, 2), first_frame, (num,))
+    if config.first_frame:
+        first = jax.random.bernoulli(jax.random.fold_in(key, 2), config.first_frame, (num,))
         index, frame = jnp.where(first, 0, index), jnp.where(first, 0, frame)
     return clip.astype(jnp.int32), index.astype(jnp.int32), frame.astype(jnp.int32)
 

@@ -27,13 +27,7 @@ ENOUGH = 0.95  # upright rate of a base that needs no training
 # PPO; the reference of a target clip is the stand, and only a fall terminates an episode.
 STANDING = Rule(runs_on=HOLD_SECONDS, replace_reference=True)
 # The teacher needs no clip any more, so it has no KL to the base.
-LEARNING: dict[str, Any] = {
-    "minibatches": 4,
-    "epochs": 4,
-    "learning_rate": 3e-4,
-    "base_kl": 0.0,
-    "equal_clips": False,
-}
+LEARNING: dict[str, Any] = {"minibatches": 4, "epochs": 4, "learning_rate": 3e-4, "base_kl": 0.0, "equal_clips": False}
 SECONDS = 2.0  # an episode: a robot that falls does so early, and short episodes have more starts
 
 

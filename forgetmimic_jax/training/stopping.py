@@ -96,7 +96,7 @@ class Stopping(Plain):
         return {"target_skill": self._skills[-1][1]} if self._skills else {}
 
     def begin(self, position: Position) -> Position:
-        return self._with_step_size(super().begin(position))
+        return self._settling(super().begin(position))
 
     def after(self, position: Position) -> Position:
         position, settling = super().after(position), settles_from(self._skills) is not None
@@ -110,9 +110,9 @@ class Stopping(Plain):
                     highlight=False,
                     soft_wrap=True,
                 )
-        return self._with_step_size(position)
+        return self._settling(position)
 
-    def _with_step_size(self, position: Position) -> Position:
+    def _settling(self, position: Position) -> Position:
         """With the share of the step size and the KL to the base that the next iteration takes."""
         self._iteration, start = position.iteration, settles_from(self._skills)
         share = 1.0 if start is None else 1.0 - (position.iteration - start) / SETTLE

@@ -116,7 +116,7 @@ def test_uniform_clips_gives_every_clip_the_same_and_every_frame_of_a_clip_the_s
     config = SamplingConfig(rule="uniform_clips")
     probabilities = bin_probabilities(config, bins, jnp.ones(bins.valid.shape))
     np.testing.assert_allclose(probabilities.sum(-1), 1.0 / 3.0, rtol=1e-6)
-    clip, _, frame = (np.asarray(x) for x in sample_start(jax.random.PRNGKey(1), probabilities, bins, DRAWS))
+    clip, _, frame = (np.asarray(x) for x in sample_start(config, jax.random.PRNGKey(1), probabilities, bins, DRAWS))
     assert stats.chisquare(np.bincount(clip, minlength=3)).pvalue > 1e-3
     for index, length in enumerate(lengths):
         counts = np.bincount(frame[clip == index], minlength=length - 1)
@@ -128,8 +128,8 @@ def test_a_share_of_the_starts_is_at_the_first_frame_of_the_same_clips():
     bins = bins_of([31, 72, 5], 10)
     probabilities = bin_probabilities(SamplingConfig(), bins, jnp.ones(bins.valid.shape))
     plain, moved = (
-        [np.asarray(x) for x in sample_start(jax.random.PRNGKey(3), probabilities, bins, DRAWS, share)]
-        for share in (0.0, 0.3)
+        [np.asarray(x) for x in sample_start(config, jax.random.PRNGKey(3), probabilities, bins, DRAWS)]
+        for config in (SamplingConfig(), SamplingConfig(first_frame=0.3))
     )
     np.testing.assert_array_equal(moved[0], plain[0])
     first = (moved[1] == 0) & (moved[2] == 0)
@@ -142,8 +142,11 @@ def test_a_share_of_the_starts_is_at_the_first_frame_of_the_same_clips():
 def test_starts_follow_the_probabilities_and_lie_in_their_bin():
     bins = bins_of([31, 72, 5], 10)
     level = jax.random.uniform(jax.random.PRNGKey(2), bins.valid.shape)
-    probabilities = bin_probabilities(SamplingConfig(), bins, level)
-    clip, index, frame = (np.asarray(x) for x in sample_start(jax.random.PRNGKey(3), probabilities, bins, DRAWS))
+    config = SamplingConfig()
+    probabilities = bin_probabilities(config, bins, level)
+    clip, index, frame = (
+        np.asarray(x) for x in sample_start(config, jax.random.PRNGKey(3), probabilities, bins, DRAWS)
+    )
     counts = np.zeros(bins.valid.shape)
     np.add.at(counts, (clip, index), 1)
     valid = np.asarray(bins.valid)
