@@ -91,7 +91,7 @@ test: .venv/.installed ## run the tests
 mutants: .venv/.installed ## see which faults of one line the tests notice (half an hour; ARGS=--list names them)
 	.venv/bin/python tests/mutants.py $(ARGS)
 
-soak: .venv/.installed ## kill, fill and mutate: an hour of faults on purpose (ARGS=--help lists the parts)
+soak: .venv/.installed ## kill, fill, mutate and train random policies: hours of faults on purpose (ARGS=--help lists the parts)
 	.venv/bin/python tests/soak.py $(ARGS)
 
 lint: .venv/.installed ## check style, formatting and types

@@ -1,14 +1,16 @@
 """Faults on purpose, in numbers: `make soak`. It is no part of `make test`.
 
-kill: kill -9 at random moments of train, unlearn, evaluate and `motions import`. No folder is half written, what was
-saved continues, and the result is that of a run that nobody killed.
+kill: kill -9 at random moments of train, unlearn, evaluate, `motions import` and evidence. No folder is half written,
+what was saved continues, and the result is that of a run that nobody killed.
 full: the same with a disk that becomes full, at a random size. It needs Linux with user namespaces.
 inputs: mutated clips, YAML, MJCF, checkpoints, ONNX, pickles and flags (mutations.py). No traceback, no code run.
+random: policies with random weights of random size train for hours. No NaN in a parameter, no growth of memory.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import hashlib
 import json
 import os
@@ -24,6 +26,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 from commands.miniature import TINY
 from conftest import SWAY_FRAMES, TURN_FRAMES, invented_clip
@@ -32,12 +35,24 @@ from mutations import FAMILIES
 from forgetmimic_jax.basics.files import read_rows
 from forgetmimic_jax.motion.clip import write_clip
 from forgetmimic_jax.motion.library import file_hash, write_manifest
+from forgetmimic_jax.ppo.state import init_state
 from forgetmimic_jax.robot.model import load_robot
+from forgetmimic_jax.settings.config import preset
+from forgetmimic_jax.settings.options import override, replace_given
+from forgetmimic_jax.tracking.env import make_assets, make_environment
+from forgetmimic_jax.tracking.setup import make_setup
 from forgetmimic_jax.training.checkpoint import META, POLICY, newest_checkpoint
+from forgetmimic_jax.training.run import make_iteration
+from forgetmimic_jax.unlearning.registry import method_of
 
 ROOT = Path(__file__).resolve().parents[1]
+COMMANDS = ("train", "unlearn", "evaluate", "import", "evidence")
 LENGTH = 40  # iterations, with a checkpoint after each second one
+LARGE = ("ppo.num_envs=64", "ppo.branches=1", "ppo.num_steps=8", "ppo.minibatches=2", "ppo.epochs=2",
+         "ppo.actor_layers=[64]", "ppo.critic_layers=[64]")  # fmt: skip
 AT_START = 0.2  # share of the kills that come at any moment; the others come after the first file was written
+RANDOM_ITERATIONS = 3
+GROWTH = 0.05  # of the memory after a tenth of the time
 PAGE, TMPFS = 2**12, 2**28  # bytes, the least that a disk has, and more than any run here writes
 
 
@@ -50,19 +65,26 @@ class Scene:
         output: the flag of the folder.
         resumes: it continues with --resume; otherwise it is given again as it is.
         result: of a folder that is finished, equal in equal runs.
+        run: of a command that adds to a run: its folder gets a copy of this one, and the flag names the copy.
     """
 
     arguments: tuple[str, ...]
     output: str
     resumes: bool
     result: Callable[[Path], Any]
+    run: Path | None = None
 
     def start(self, folder: Path) -> subprocess.Popen:
         """The command, as it starts or continues in the folder."""
         resume = self.resumes and newest_checkpoint(folder) is not None
         if self.resumes and not resume:
             shutil.rmtree(folder, ignore_errors=True)  # nothing in it to continue with
-        command = [sys.executable, "-m", "forgetmimic_jax", *self.arguments, self.output, str(folder)]
+        named = folder
+        if self.run is not None:
+            named = folder / self.run.name
+            if not folder.exists():
+                shutil.copytree(self.run, named)
+        command = [sys.executable, "-m", "forgetmimic_jax", *self.arguments, self.output, str(named)]
         environment = os.environ | {"PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
         return subprocess.Popen(
             command + ["--resume"] * resume,
@@ -84,6 +106,12 @@ def trained(folder: Path) -> Any:
 def evaluated(folder: Path) -> Any:
     """The measured numbers."""
     return json.loads((folder / "evaluation.json").read_text())["policies"]
+
+
+def attacked(folder: Path) -> Any:
+    """What every attack found, and the control that was made."""
+    document = json.loads((folder / "run" / "evidence.json").read_text())
+    return {name: value for name, value in document.items() if name != "made"}, trained(folder / "run-control")
 
 
 def imported(folder: Path) -> Any:
@@ -129,18 +157,31 @@ def scenes(folder: Path, wanted: Collection[str]) -> dict[str, Scene]:
     length = ("--iterations", str(LENGTH))
     train = ("train", "--library", str(library), *length, "--set", *TINY)
     base = folder / "base"
-    if {"unlearn", "evaluate"} & set(wanted):
-        said, code = finish(Scene(train, "--output", True, trained).start(base))
-        assert code == 0, said
+    if {"unlearn", "evaluate", "evidence"} & set(wanted):
+        undisturbed(Scene(train, "--output", True, trained), base)
     checkpoint = str(newest_checkpoint(base))
     forget = ("unlearn", "--base", checkpoint, "--targets", "turn", "--episodes", "2", *length)
     measure = ("evaluate", "--checkpoint", checkpoint, "--episodes", "2")
     convert = ("motions", "import", str(folder / "turn.csv"), "--fps", "50", "--force")
+    unlearn, run = Scene(forget, "--output", True, trained), folder / "run"
+    if "evidence" in wanted:
+        undisturbed(unlearn, run)
+    short = (
+        "--episodes",
+        "2",
+        "--control-iterations",
+        "8",
+        "--recovery-iterations",
+        "8",
+        "--relearning-iterations",
+        "8",
+    )
     every = {
         "train": Scene(train, "--output", True, trained),
-        "unlearn": Scene(forget, "--output", True, trained),
+        "unlearn": unlearn,
         "evaluate": Scene(measure, "--output", False, evaluated),
         "import": Scene(convert, "--library", False, imported),
+        "evidence": Scene(("evidence", *short), "--run", False, attacked, run),
     }
     return {name: scene for name, scene in every.items() if name in wanted}
 
@@ -245,20 +286,62 @@ def inputs(family: str, times: int, keep: Path) -> list[str]:
     return faults + [f"{row['ended']}: {row['fault']}" for row in read_rows(journal) if row.get("fault")]
 
 
+def random_policies(minutes: float, seed: int, say: Callable[[str], None]) -> list[str]:
+    """Train policies with random weights, each for some iterations, for so many minutes; returns the faults.
+
+    The weights of each are scaled by a factor from 0.1 to 100, so that actions go from none to the joints' limits. The
+    robot has noise, pushes and self-collision, and the shipped clips.
+    """
+    config = replace_given(override(preset("cpu"), LARGE), robot="g1")
+    noise, physics = (dataclasses.replace(part, **on) for part, on in ((config.noise, {"enabled": True}),
+                      (config.physics, {"self_collision": True, "engine": "native"})))  # fmt: skip
+    setup = make_setup(dataclasses.replace(config, noise=noise, physics=physics))
+    env, assets = make_environment(setup, setup.config.ppo.num_envs), make_assets(setup)
+    iterate = make_iteration(env, method_of(setup.config))
+    fresh = jax.jit(lambda assets, key: init_state(env, assets, key))
+    rng, faults, memory, done, begin = random.Random(seed), [], {}, 0, time.monotonic()
+    while (passed := (time.monotonic() - begin) / 60.0) < minutes:
+        scale = 10.0 ** rng.uniform(-1.0, 2.0)
+        state = fresh(assets, jax.random.PRNGKey(rng.randrange(2**31)))
+        larger = jax.tree.map(lambda leaf: leaf * np.float32(scale), state.policy.parameters)
+        state = dataclasses.replace(state, policy=state.policy.with_parameters(larger))
+        for _ in range(RANDOM_ITERATIONS):
+            state, _ = iterate(assets, state)
+        for path, leaf in jax.tree_util.tree_leaves_with_path((state.policy, state.failure_level)):
+            if not np.isfinite(leaf).all():
+                faults.append(f"policy {done}, weights x {scale:.3g}: {jax.tree_util.keystr(path)} is not finite")
+        done += 1
+        memory[passed] = resident()
+        if done % 1000 == 0:
+            say(f"random: {passed:.0f} min, {done} policies, {memory[passed] / 2**20:.0f} MiB, {len(faults)} faults")
+    early = max(size for at, size in memory.items() if at <= 0.1 * minutes)
+    grown = max(memory.values()) / early - 1.0
+    steps = done * RANDOM_ITERATIONS * setup.config.ppo.num_envs * setup.config.ppo.num_steps
+    say(f"random: {done} policies, {steps:,} control steps; memory {early / 2**20:.0f} MiB after a tenth of the time, "
+        f"then {grown:+.1%} at most")  # fmt: skip
+    return faults + [f"memory grew by {grown:.0%}"] * (grown > GROWTH)
+
+
+def resident() -> int:
+    """Bytes of memory that this process holds."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
 def main() -> int:
     """The command; returns its exit code."""
     parser = argparse.ArgumentParser(prog="make soak", description="Kill, fill and mutate.")
-    parser.add_argument("part", nargs="*", help="kill, full, inputs (default: all)")
+    parser.add_argument("part", nargs="*", help="kill, full, inputs, random (default: all)")
     parser.add_argument("--times", type=int, default=50, help="kills, disks and mutations of each kind (default: 50)")
     parser.add_argument("--only", nargs="+", help="commands of kill and full, families of inputs")
+    parser.add_argument("--minutes", type=float, default=120.0, help="of random policies (default: 120)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--keep", type=Path, default=Path("runs/soak"), help="folder for inputs with a fault")
     given = parser.parse_args()
-    parts, rng, found = given.part or ["kill", "full", "inputs"], random.Random(given.seed), {}
+    parts, rng, found = given.part or ["kill", "full", "inputs", "random"], random.Random(given.seed), {}
     if "full" in parts and "SOAK_NAMESPACE" not in os.environ:  # to mount disks; its own, nobody else sees them
         os.execvpe("unshare", ["unshare", "-rm", sys.executable, *sys.argv], os.environ | {"SOAK_NAMESPACE": "1"})
     with tempfile.TemporaryDirectory() as name:
-        wanted = (given.only or ("train", "unlearn", "evaluate", "import")) if {"kill", "full"} & set(parts) else ()
+        wanted = (given.only or COMMANDS) if {"kill", "full"} & set(parts) else ()
         commands = scenes(Path(name), wanted)
         for part, disturb in (("kill", kill), ("full", fill)):
             if part in parts:
@@ -273,6 +356,8 @@ def main() -> int:
             if not given.only or family in given.only:
                 found[f"inputs {family}"] = faults = inputs(family, given.times, given.keep)
                 print(f"inputs {family}: {given.times} times, {len(faults)} faults", flush=True)
+    if "random" in parts:
+        found["random"] = random_policies(given.minutes, given.seed, lambda line: print(line, flush=True))
     faults = [f"{where}: {fault}" for where, some in found.items() for fault in some]
     print("\n".join([*faults, f"{len(faults)} faults"]))
     return 1 if faults else 0

@@ -111,9 +111,11 @@ def student_config(
     """
     layouts = sorted({policy.description.layout.name for policy in policies})
     modes = sorted({policy.description.action.mode for policy in policies})
-    for flag, given, found in (("--layout", layout, layouts), ("--action-mode", mode, modes)):
-        if given is None and len(found) > 1:
-            raise InputError(f"{flag}: the policies have {' and '.join(found)}; name the one of the new policy")
+    choices = (("--layout", layout, layouts), ("--action-mode", mode, modes))
+    open_ones = [(flag, " and ".join(found)) for flag, given, found in choices if given is None and len(found) > 1]
+    if open_ones:
+        flags, found = zip(*open_ones, strict=True)
+        raise InputError(f"{' and '.join(flags)}: the policies have {', '.join(found)}; name that of the new policy")
     gains = {name: _gains(name, policies, robot) for name in ("stiffness", "damping")}
     action = ActionConfig(mode or modes[0], **gains)  # type: ignore[arg-type]
     contact = max(policy.config(config).termination.contact_force for policy in policies)

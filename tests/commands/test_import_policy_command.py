@@ -262,7 +262,7 @@ def test_several_policies_become_one_base_with_all_clips(merged, robot):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({}, "--layout: the policies have mjlab154 and mjlab160; name the one of the new policy"),
+        ({}, "--layout: the policies have mjlab154 and mjlab160; name that of the new policy"),
         ({"library": Path("data")}, "--library: found with several policies; accepted with one: each of several needs"),
     ],
 )
