@@ -35,11 +35,11 @@ from mutations import FAMILIES
 from forgetmimic_jax.basics.files import read_rows
 from forgetmimic_jax.motion.clip import write_clip
 from forgetmimic_jax.motion.library import file_hash, write_manifest
-from forgetmimic_jax.ppo.state import init_state
+from forgetmimic_jax.ppo.state import TrainState, init_state
 from forgetmimic_jax.robot.model import load_robot
 from forgetmimic_jax.settings.config import preset
 from forgetmimic_jax.settings.options import override, replace_given
-from forgetmimic_jax.tracking.env import make_assets, make_environment
+from forgetmimic_jax.tracking.env import Assets, make_assets, make_environment
 from forgetmimic_jax.tracking.setup import make_setup
 from forgetmimic_jax.training.checkpoint import META, POLICY, newest_checkpoint
 from forgetmimic_jax.training.run import make_iteration
@@ -48,9 +48,12 @@ from forgetmimic_jax.unlearning.registry import method_of
 ROOT = Path(__file__).resolve().parents[1]
 COMMANDS = ("train", "unlearn", "evaluate", "import", "evidence")
 LENGTH = 40  # iterations, with a checkpoint after each second one
-LARGE = ("ppo.num_envs=64", "ppo.branches=1", "ppo.num_steps=8", "ppo.minibatches=2", "ppo.epochs=2",
-         "ppo.actor_layers=[64]", "ppo.critic_layers=[64]")  # fmt: skip
 AT_START = 0.2  # share of the kills that come at any moment; the others come after the first file was written
+RANDOM = (
+    *("physics.engine=native", "physics.self_collision=true", "noise.enabled=true", "ppo.num_envs=64"),
+    *("ppo.branches=1", "ppo.num_steps=8", "ppo.minibatches=2", "ppo.epochs=2"),
+    *("ppo.actor_layers=[64]", "ppo.critic_layers=[64]"),
+)
 RANDOM_ITERATIONS = 3
 GROWTH = 0.05  # of the memory after a tenth of the time
 PAGE, TMPFS = 2**12, 2**28  # bytes, the least that a disk has, and more than any run here writes
@@ -166,22 +169,13 @@ def scenes(folder: Path, wanted: Collection[str]) -> dict[str, Scene]:
     unlearn, run = Scene(forget, "--output", True, trained), folder / "run"
     if "evidence" in wanted:
         undisturbed(unlearn, run)
-    short = (
-        "--episodes",
-        "2",
-        "--control-iterations",
-        "8",
-        "--recovery-iterations",
-        "8",
-        "--relearning-iterations",
-        "8",
-    )
+    trainings = [f"--{kind}-iterations=8" for kind in ("control", "recovery", "relearning")]
     every = {
         "train": Scene(train, "--output", True, trained),
         "unlearn": unlearn,
         "evaluate": Scene(measure, "--output", False, evaluated),
         "import": Scene(convert, "--library", False, imported),
-        "evidence": Scene(("evidence", *short), "--run", False, attacked, run),
+        "evidence": Scene(("evidence", "--episodes", "2", *trainings), "--run", False, attacked, run),
     }
     return {name: scene for name, scene in every.items() if name in wanted}
 
@@ -292,19 +286,20 @@ def random_policies(minutes: float, seed: int, say: Callable[[str], None]) -> li
     The weights of each are scaled by a factor from 0.1 to 100, so that actions go from none to the joints' limits. The
     robot has noise, pushes and self-collision, and the shipped clips.
     """
-    config = replace_given(override(preset("cpu"), LARGE), robot="g1")
-    noise, physics = (dataclasses.replace(part, **on) for part, on in ((config.noise, {"enabled": True}),
-                      (config.physics, {"self_collision": True, "engine": "native"})))  # fmt: skip
-    setup = make_setup(dataclasses.replace(config, noise=noise, physics=physics))
+    setup = make_setup(replace_given(override(preset("cpu"), RANDOM), robot="g1"))
     env, assets = make_environment(setup, setup.config.ppo.num_envs), make_assets(setup)
     iterate = make_iteration(env, method_of(setup.config))
-    fresh = jax.jit(lambda assets, key: init_state(env, assets, key))
+
+    @jax.jit
+    def fresh(assets: Assets, key: jax.Array, scale: float) -> TrainState:
+        state = init_state(env, assets, key)
+        larger = jax.tree.map(lambda leaf: leaf * scale, state.policy.parameters)
+        return dataclasses.replace(state, policy=state.policy.with_parameters(larger))
+
     rng, faults, memory, done, begin = random.Random(seed), [], {}, 0, time.monotonic()
     while (passed := (time.monotonic() - begin) / 60.0) < minutes:
         scale = 10.0 ** rng.uniform(-1.0, 2.0)
-        state = fresh(assets, jax.random.PRNGKey(rng.randrange(2**31)))
-        larger = jax.tree.map(lambda leaf: leaf * np.float32(scale), state.policy.parameters)
-        state = dataclasses.replace(state, policy=state.policy.with_parameters(larger))
+        state = fresh(assets, jax.random.PRNGKey(rng.randrange(2**31)), scale)
         for _ in range(RANDOM_ITERATIONS):
             state, _ = iterate(assets, state)
         for path, leaf in jax.tree_util.tree_leaves_with_path((state.policy, state.failure_level)):
