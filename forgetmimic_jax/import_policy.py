@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from forgetmimic_jax.exchange.adopt import Adopted
     from forgetmimic_jax.exchange.foreign import ForeignPolicy
     from forgetmimic_jax.exchange.trial import Tracked
+    from forgetmimic_jax.policy.policy import Policy
     from forgetmimic_jax.robot.model import Robot
     from forgetmimic_jax.settings.config import Config
 
@@ -52,8 +53,8 @@ class Options:
     """First second of a policy's clip to take."""
     reference: Path | None = None
     """JSON or YAML with joint_error (rad) and reward that the roll-out must give to 0.01, also by clip."""
-    episodes: int = 20
-    """Episodes with reset noise, a clip."""
+    episodes: int = 50
+    """Episodes with reset noise, a clip; several policies are compared with the new one on them."""
     preset: Preset = "cpu"
     """Settings for further training: cpu for a laptop, paper for a GPU."""
     activation: str | None = None
@@ -138,9 +139,16 @@ def _several(
         _say("\n".join(one.facts))
     setup = own_setup(wanted, [clip for one in taught for clip, _ in one.clips])
     teachers = [(experts.expert(one.setup, one.policy, setup), [place]) for place, one in enumerate(taught)]
-    with progress("merge", experts.MERGING.rounds) as report:
-        student, steps = experts.merge(setup, teachers, report)
-    trial = try_out(setup, student, episodes=options.episodes, seed=options.seed)
+    trials = []
+
+    def is_enough(student: Policy) -> bool:
+        trials.append(try_out(setup, student, episodes=options.episodes, seed=options.seed))
+        return not experts.shortfalls(known, trials[-1].clips)
+
+    most = experts.MERGING.rounds + experts.REPEATS * experts.MORE.rounds
+    with progress("merge", most, at_most=True) as report:
+        student, steps = experts.merge(setup, teachers, is_enough, report)
+    trial = trials[-1]
     _say_figures({"experts": known, "new policy": trial.clips})
     shortfalls = experts.shortfalls(known, trial.clips)
     _say("\n".join(shortfalls or ["The new policy is within 2 points of survival and 0.02 of reward of every expert."]))

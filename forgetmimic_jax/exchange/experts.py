@@ -38,6 +38,8 @@ STUDENT_LAYERS = (512, 256, 128)
 STUDENT_STD = 0.4  # in units of action: of the regression's loss, and of the exploration that fine-tuning starts with
 ROBOTS = 512
 MERGING = DistilConfig(rounds=112, noise_rounds=16, normalizer_rounds=48)  # 16 rounds a share of the experts
+MORE = DistilConfig(rounds=48, expert_share=(0.0,), noise_rounds=0, normalizer_rounds=0)  # of a student that is behind
+REPEATS = 4  # of MORE, at most
 
 
 @struct.dataclass
@@ -175,16 +177,19 @@ def _gains(name: Literal["stiffness", "damping"], policies: Sequence[ForeignPoli
 def merge(
     student: Setup,
     experts: Sequence[tuple[Expert, Sequence[int]]],
+    is_enough: Callable[[Policy], bool],
     report: Callable[[int, int, Mapping[str, float]], None] = lambda done, steps, metrics: None,
 ) -> tuple[Policy, int]:
     """Regress a fresh policy on experts, each with the clips of the student's library that it teaches.
 
     DAgger (Ross et al. 2011): the experts' share of the steps falls from 1 to 0, every state is labelled by the expert
-    of its clip. Starts are spread over the clips, with reset noise.
+    of its clip. Starts are spread over the clips, with reset noise. A student that is not enough then learns on its own
+    states alone, for `MORE.rounds` at a time.
 
     Args:
         student: robot, clips and settings of the new policy.
         experts: with the indices of their clips.
+        is_enough: whether a student is as good as its experts.
         report: called after each round with the rounds and control steps done and the round's metrics.
 
     Returns:
@@ -195,8 +200,15 @@ def merge(
     key = jax.random.PRNGKey(student.config.seed)
     fresh = jax.jit(lambda assets, key: init_state(env, assets, key).policy)(assets, key)
     teaching = make_teaching(assets, experts)
-    state, one_round = begin(env, assets, teaching, fresh, key), make_round(env, MERGING)
-    for done in range(1, MERGING.rounds + 1):
-        state, metrics = one_round(assets, teaching, state)
-        report(done, done * ROBOTS * MERGING.steps, {name: float(value) for name, value in metrics.items()})
-    return state.student, MERGING.rounds * ROBOTS * MERGING.steps
+    state = begin(env, assets, teaching, fresh, key)
+    first, more = (MERGING, make_round(env, MERGING)), (MORE, make_round(env, MORE))
+    done = steps = 0
+    for config, one_round in (first, *(more,) * REPEATS):
+        state = dataclasses.replace(state, round=jnp.zeros((), jnp.int32))
+        for _ in range(config.rounds):
+            state, metrics = one_round(assets, teaching, state)
+            done, steps = done + 1, steps + ROBOTS * config.steps
+            report(done, steps, {name: float(value) for name, value in metrics.items()})
+        if is_enough(state.student):
+            break
+    return state.student, steps

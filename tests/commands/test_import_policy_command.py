@@ -238,7 +238,11 @@ def merged(two_files, tmp_path_factory):
     """Two rounds of regression on a handful of robots."""
     output = tmp_path_factory.mktemp("runs") / "merged"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(experts, "MERGING", DistilConfig(rounds=2, steps=4, epochs=1, minibatches=2, check_every=9))
+        patch.setattr(experts, "MERGING", DistilConfig(rounds=2, steps=4, epochs=1, minibatches=2))
+        patch.setattr(experts, "MORE", DistilConfig(rounds=3, steps=4, expert_share=(0.0,), epochs=1, minibatches=2))
+        patch.setattr(experts, "REPEATS", 4)
+        behind = iter([["kick: survival 90%, the expert's is 100%."]] * 2 + [[]] * 2)  # twice, then no longer
+        patch.setattr(experts, "shortfalls", lambda known, found: next(behind))
         patch.setattr(experts, "ROBOTS", 8)
         patch.setattr(experts, "STUDENT_LAYERS", (16,))
         options = import_policy.Options(files=two_files, layout="mjlab154", episodes=1, output=output)
@@ -253,7 +257,8 @@ def test_several_policies_become_one_base_with_all_clips(merged, robot):
     assert info.config.action.mode == "offset"
     assert info.config.action.stiffness == {}  # the gains are the robot's own, in three digits
     assert info.config.action.default_pose == {}
-    assert info.environment_steps == 2 * 8 * 4
+    assert info.environment_steps == (2 + 2 * 3) * 8 * 4  # it learns on twice, until it is not behind
+    assert "The new policy is within 2 points of survival" in merged.printed
     assert "kick (experts)" in merged.printed
     assert "turn (new policy)" in merged.printed
     load_policy(merged.folder / "base")
