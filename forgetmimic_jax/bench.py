@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from forgetmimic_jax.basics.errors import InputError, run_command
-from forgetmimic_jax.basics.provenance import cores
+from forgetmimic_jax.basics.provenance import cores, made_here
 from forgetmimic_jax.settings.config import EngineName, Preset
 from forgetmimic_jax.settings.options import at_least, comma_separated, on_engine, parse, replace_given
 
@@ -86,7 +86,7 @@ def main(options: Options) -> None:
         show(figures, f"{options.robot}, preset {options.preset}, {figures['engine']} engine")
     if options.output:
         options.output.parent.mkdir(parents=True, exist_ok=True)
-        options.output.write_text(json.dumps(figures, indent=2) + "\n")
+        options.output.write_text(json.dumps(figures | {"made": dataclasses.asdict(made_here())}, indent=2) + "\n")
         print(f"figures  {options.output}")
 
 
@@ -212,7 +212,7 @@ def _figures_of(
         last = (done.stderr or done.stdout).strip().splitlines()[-1:]
         raise InputError(f"{root}: its bench ended with exit code {done.returncode}: {' '.join(last)}")
     figures: dict[str, Any] = json.loads(output.read_text())
-    return figures
+    return {name: value for name, value in figures.items() if name != "made"}
 
 
 def _medians(runs: Sequence[Mapping[str, Any]]) -> dict[str, float]:

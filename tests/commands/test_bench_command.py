@@ -26,6 +26,7 @@ def test_every_part_of_an_iteration_is_timed(tiny, tmp_path, library_folder):
     figures = json.loads(output.read_text())
     assert (figures["engine"], figures["environments"]) == ("native", 8)
     assert figures["raw_control_steps_per_second"] > figures["iteration_control_steps_per_second"] > 0.0
+    assert len(figures["made"]["code"]) == 8
     shares = [figures[name] for name in figures if name.startswith("share_")]
     assert sum(shares) == pytest.approx(1.0)
 
