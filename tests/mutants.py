@@ -708,6 +708,11 @@ MUTANTS = (
            "The page forgets a fall when the robot gets up.",
            "if falls and self.fell[policy] is None:",
            "if falls:"),
+    # Several processes: all go the way of the first.
+    Mutant("agreed_alone", "forgetmimic_jax/training/devices.py", "tests/commands/test_devices.py",
+           "Every process ends where its own evaluation says, and waits for ever for the others.",
+           "return value if jax.process_count() == 1 else",
+           "return value if True else"),
 )
 # fmt: on
 

@@ -41,9 +41,12 @@ SETTINGS = [*TINY, "wrench.max_gain=0", "ppo.minibatches=1", "ppo.schedule=fixed
 
 def process(output: Path, *arguments: object, **environment: object) -> subprocess.Popen:
     """`train` with these arguments in a process of its own."""
-    command = [sys.executable, "-m", "forgetmimic_jax", "train", "--output", output, *arguments]
+    return python("-m", "forgetmimic_jax", "train", "--output", output, *arguments, **environment)
+
+
+def python(*arguments: object, **environment: object) -> subprocess.Popen:
     return subprocess.Popen(
-        [*map(str, command)],
+        [sys.executable, *map(str, arguments)],
         env={**os.environ, **{name: str(value) for name, value in environment.items()}},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -208,6 +211,38 @@ def test_a_run_of_two_devices_continues_on_one(runs, setup, tmp_path):
     iterate = run_module.make_iteration(env, method_of(setup.config))
     expected, _ = iterate(make_assets(setup), load_state(runs.two.checkpoint(ITERATIONS)))
     assert_same(load_state(resumed.checkpoint(ITERATIONS + 1)), expected)
+
+
+ENDS = """
+import dataclasses, sys
+from pathlib import Path
+from types import SimpleNamespace
+import jax
+from rich.console import Console
+from forgetmimic_jax.settings.config import UnlearnConfig, load_config
+from forgetmimic_jax.tracking.env import make_assets
+from forgetmimic_jax.tracking.setup import make_setup
+from forgetmimic_jax.training import stopping
+from forgetmimic_jax.training.course import Position
+
+settings, address, process = sys.argv[1:]
+jax.distributed.initialize(address, 2, int(process))
+stopping.Targets = lambda setup: SimpleNamespace(skill=lambda policy: float(process))
+unlearn = UnlearnConfig(("turn",), settings={"penalty": 16.0}, stop_every=5)
+setup = make_setup(dataclasses.replace(load_config(Path(settings)), evaluate_every=0, unlearn=unlearn))
+course = stopping.Stopping(setup, None, Path("."), Console(), None)
+position = course.begin(Position(SimpleNamespace(policy=None), make_assets(setup), 0, 0))
+while not course.finished and position.iteration < 100:
+    position = course.after(dataclasses.replace(position, iteration=position.iteration + 1))
+print("the last iteration is", position.iteration)
+"""
+
+
+def test_two_processes_end_together_where_the_first_ones_targets_are_at_the_baseline(runs):
+    """The second process measures a skill of 1 throughout; alone it would never end."""
+    address = f"127.0.0.1:{free_port()}"
+    both = [python("-c", ENDS, runs.one.folder / "config.yaml", address, number) for number in range(2)]
+    assert [printed(process).splitlines()[-1] for process in both] == ["the last iteration is 70"] * 2
 
 
 COMMANDS = [(train.main, train.Options), (pretrain.main, pretrain.Options), (unlearn.main, unlearn.Options)]
