@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from forgetmimic_jax.evaluation.metrics import ZERO_ACTION
 from forgetmimic_jax.evaluation.plots import bars, new_figure
 from forgetmimic_jax.evaluation.repeats import Repeat, over_repeats
-from forgetmimic_jax.evaluation.statistics import Estimate
+from forgetmimic_jax.evaluation.statistics import PlainEstimate
 from forgetmimic_jax.evaluation.tables import markdown_table, number, percent
 from forgetmimic_jax.settings.options import comma_separated
 from forgetmimic_jax.studies.claim import Finding, finding
@@ -86,7 +86,7 @@ def kinds(lab: Lab) -> dict[str, list[Clip]]:
     return result | {f"library {name}": read_library(robot, folder) for name, folder in libraries(lab).items()}
 
 
-def over_bases(of: Document, metric: str, clip: str | None = None) -> Estimate:
+def over_bases(of: Document, metric: str, clip: str | None = None) -> PlainEstimate:
     """A metric of one kind and policy over the bases: of a clip, or the mean over the clips."""
     means = {
         repeat: sum(numbers[metric] for name, numbers in clips.items() if clip in (None, name))

@@ -12,7 +12,7 @@ import numpy as np
 from forgetmimic_jax.evaluation.membership import FALSE_POSITIVES, attack, features
 from forgetmimic_jax.evaluation.plots import bars, new_figure
 from forgetmimic_jax.evaluation.repeats import Repeat
-from forgetmimic_jax.evaluation.statistics import Estimate
+from forgetmimic_jax.evaluation.statistics import PlainEstimate
 from forgetmimic_jax.evaluation.tables import markdown_table, number
 from forgetmimic_jax.studies import paper
 from forgetmimic_jax.studies.claim import FAILS, OPEN, Finding, finding, p_value
@@ -106,7 +106,7 @@ def answer(document: Document) -> str:
     return f"The AUC of the attack is {number(auc, 2)}, where guessing has {GUESSED}{marked}."
 
 
-def told_apart(auc: Estimate) -> str:
+def told_apart(auc: PlainEstimate) -> str:
     """The word for "the attack cannot tell": an interval around guessing leaves it open."""
     if "low" not in auc:
         return OPEN

@@ -18,7 +18,7 @@ from forgetmimic_jax.basics.errors import InputError, nearest
 from forgetmimic_jax.evaluation.metrics import MINIMUM_SKILL_RANGE
 from forgetmimic_jax.evaluation.plots import new_figure
 from forgetmimic_jax.evaluation.repeats import over_repeats
-from forgetmimic_jax.evaluation.statistics import Estimate
+from forgetmimic_jax.evaluation.statistics import PlainEstimate
 from forgetmimic_jax.evaluation.tables import markdown_table, number, percent
 from forgetmimic_jax.studies.claim import Finding, finding
 from forgetmimic_jax.studies.conduct import main
@@ -167,7 +167,7 @@ def correlations(results: Mapping[str, Any]) -> dict[str, float]:
     return {repeat: float(np.mean(of)) for repeat, of in found.items() if len(of) == targets}
 
 
-def neighbours_loss(variant: Mapping[str, Any], target: str, neighbour: str) -> Estimate | None:
+def neighbours_loss(variant: Mapping[str, Any], target: str, neighbour: str) -> PlainEstimate | None:
     """Retention of the neighbour minus the mean of the other kept clips'; None where the base does not track it."""
     kept = retention(variant, target)
     of = {

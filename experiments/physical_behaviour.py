@@ -12,7 +12,7 @@ from experiments.validity import LENGTH, NO_FURTHER_OFF, SOONER
 from forgetmimic_jax.evaluation import metrics, tables
 from forgetmimic_jax.evaluation.plots import new_figure
 from forgetmimic_jax.evaluation.repeats import Repeat, over_repeats
-from forgetmimic_jax.evaluation.statistics import Estimate
+from forgetmimic_jax.evaluation.statistics import PlainEstimate
 from forgetmimic_jax.evaluation.tables import UNITS, markdown_table, number, percent
 from forgetmimic_jax.studies.claim import Finding, finding
 from forgetmimic_jax.studies.conduct import main
@@ -62,7 +62,7 @@ def measure(lab: Lab) -> dict[str, Any]:
     return {"policies": result, "unbounded": without_end}
 
 
-def over_runs(policies: Document, label: str, name: str) -> Estimate:
+def over_runs(policies: Document, label: str, name: str) -> PlainEstimate:
     """A measure of a kind of policy, over its runs."""
     return over_repeats({repeat: float(np.mean(run[name])) for repeat, run in policies[label].items()})
 
@@ -111,7 +111,7 @@ def unbounded_table(policies: Document) -> str:
     return f"\n**Without terminations**\n\n{markdown_table(['', *policies], rows)}\n{note}"
 
 
-def unbounded_over_runs(policies: Document, label: str, name: str) -> Estimate | None:
+def unbounded_over_runs(policies: Document, label: str, name: str) -> PlainEstimate | None:
     """A number of `tables.UNBOUNDED` of a kind of policy, over its runs; None where no run defines it."""
     quantile = {"impact_force_median": 0.5, "impact_force_95": 0.95}.get(name)
     runs = {repeat: run["impact_force" if quantile else name] for repeat, run in policies[label].items()}

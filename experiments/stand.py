@@ -14,7 +14,7 @@ from forgetmimic_jax.evaluation.document import read_evaluation
 from forgetmimic_jax.evaluation.metrics import BASE, UNLEARNED
 from forgetmimic_jax.evaluation.plots import bars, new_figure
 from forgetmimic_jax.evaluation.repeats import over_repeats
-from forgetmimic_jax.evaluation.statistics import Estimate
+from forgetmimic_jax.evaluation.statistics import PlainEstimate
 from forgetmimic_jax.evaluation.tables import markdown_table, number, percent
 from forgetmimic_jax.studies.claim import Finding, finding
 from forgetmimic_jax.studies.conduct import main
@@ -83,13 +83,13 @@ def seconds(folder: Path) -> float:
     return float(sum(row["seconds"] for row in rows))
 
 
-def estimate(runs: Mapping[str, Mapping[str, float]], name: str) -> Estimate | None:
+def estimate(runs: Mapping[str, Mapping[str, float]], name: str) -> PlainEstimate | None:
     """A number over the repeats that have it."""
     values = {repeat: of[name] for repeat, of in runs.items() if name in of}
     return over_repeats(values) if values else None
 
 
-def rate(runs: Mapping[str, Mapping[str, float]], name: str) -> Estimate | None:
+def rate(runs: Mapping[str, Mapping[str, float]], name: str) -> PlainEstimate | None:
     """A rate over the repeats, its interval cut at 0 and 1."""
     value = estimate(runs, name)
     return within(value, 0.0, 1.0) if value else None
@@ -117,7 +117,7 @@ def body(document: Document) -> str:
     return f"{markdown_table(header, rows)}\n{note}"
 
 
-def minutes(runs: Mapping[str, Mapping[str, float]]) -> Estimate:
+def minutes(runs: Mapping[str, Mapping[str, float]]) -> PlainEstimate:
     """How long the runs trained."""
     return over_repeats({repeat: of[SECONDS] / 60.0 for repeat, of in runs.items()})
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from forgetmimic_jax.basics.files import read_rows
 from forgetmimic_jax.evaluation.plots import new_figure
-from forgetmimic_jax.evaluation.statistics import Estimate
+from forgetmimic_jax.evaluation.statistics import PlainEstimate
 from forgetmimic_jax.evaluation.tables import FORGOTTEN, markdown_table, number
 from forgetmimic_jax.studies.claim import Finding, finding
 from forgetmimic_jax.studies.conduct import main
@@ -105,11 +105,11 @@ def findings(document: Document) -> Iterator[Finding]:
         yield finding(f"{B}: the targets' anti-reward goes to nothing", last, bound, evidence, below=False)
 
 
-def difference(last: Estimate, first: Estimate) -> Estimate:
+def difference(last: PlainEstimate, first: PlainEstimate) -> PlainEstimate:
     """Of two estimates whose runs are not known one by one: as wide as both intervals together."""
-    result: Estimate = {"mean": last["mean"] - first["mean"], "n": last["n"]}
+    result: PlainEstimate = {"mean": last["mean"] - first["mean"], "n": last["n"]}
     if "low" in last and "low" in first:
-        ends: Estimate = {"low": last["low"] - first["high"], "high": last["high"] - first["low"]}
+        ends: PlainEstimate = {"low": last["low"] - first["high"], "high": last["high"] - first["low"]}
         result |= {**ends, "std": last["std"] + first["std"]}
     return result
 

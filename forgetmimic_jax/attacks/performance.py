@@ -170,5 +170,5 @@ def _mean(values: np.ndarray, weights: np.ndarray) -> Estimate | None:
     return _typed(statistics.bootstrap_mean(values[defined], chosen / total * defined.sum()))
 
 
-def _typed(estimate: statistics.Estimate) -> Estimate:
+def _typed(estimate: statistics.PlainEstimate) -> Estimate:
     return msgspec.convert(estimate, Estimate)

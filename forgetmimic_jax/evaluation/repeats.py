@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from forgetmimic_jax.evaluation import statistics
-from forgetmimic_jax.evaluation.statistics import Estimate
+from forgetmimic_jax.evaluation.statistics import PlainEstimate
 
 
 class Repeat(NamedTuple):
@@ -31,7 +31,7 @@ def base_of(repeat: str) -> int:
     return int(repeat.partition(",")[0].removeprefix("base "))
 
 
-def over_repeats(values: Mapping[str, float]) -> Estimate:
+def over_repeats(values: Mapping[str, float]) -> PlainEstimate:
     """Mean of numbers by repeat, with Student's interval over the bases, or over the seeds where there is one base.
 
     A base's number is the mean over its seeds, so that bases weigh the same whatever their number of runs. The

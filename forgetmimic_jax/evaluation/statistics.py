@@ -15,8 +15,8 @@ CONFIDENCE = 0.95
 RESAMPLES = 2000
 
 
-class Estimate(TypedDict, total=False):
-    """A mean and its 95 % interval. A number that is undefined is absent: JSON has no NaN.
+class PlainEstimate(TypedDict, total=False):
+    """An `evaluation.document.Estimate` as a plain dict, as a JSON file holds it: what is undefined is absent.
 
     `std` is the standard deviation over the n units; for a ratio, which no single unit has, that of the bootstrap.
     `episodes` is there where the interval is the exact one of a rate over the episodes of all units together.
@@ -30,11 +30,11 @@ class Estimate(TypedDict, total=False):
     episodes: int
 
 
-def estimate(mean: float, low: float, high: float, std: float, n: int) -> Estimate:
+def estimate(mean: float, low: float, high: float, std: float, n: int) -> PlainEstimate:
     """An estimate of what is finite among its numbers."""
     numbers = {"mean": mean, "low": low, "high": high, "std": std}
     finite = {name: float(number) for name, number in numbers.items() if np.isfinite(number)}
-    return Estimate(**finite, n=int(n))  # type: ignore[typeddict-item]
+    return PlainEstimate(**finite, n=int(n))  # type: ignore[typeddict-item]
 
 
 def resampling_weights(strata: np.ndarray, *, seed: int, resamples: int = RESAMPLES) -> np.ndarray:
@@ -63,13 +63,13 @@ def resampled_mean(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return weights @ values / len(values)
 
 
-def bootstrap_mean(values: np.ndarray, weights: np.ndarray) -> Estimate:
+def bootstrap_mean(values: np.ndarray, weights: np.ndarray) -> PlainEstimate:
     """Mean over episodes with the percentile interval of its resampled means."""
     std = np.std(values, ddof=1) if len(values) > 1 else np.nan
     return estimate(np.mean(values), *_percentiles(resampled_mean(values, weights)), std, len(values))
 
 
-def bootstrap_quantile(values: np.ndarray, weights: np.ndarray, share: float) -> Estimate:
+def bootstrap_quantile(values: np.ndarray, weights: np.ndarray, share: float) -> PlainEstimate:
     """The least of `values` f[E] that at least `share` of them do not exceed, with its percentile interval.
 
     Args:
@@ -93,14 +93,14 @@ def bootstrap_quantile(values: np.ndarray, weights: np.ndarray, share: float) ->
 
 def bootstrap_of_means(
     function: Callable[..., np.ndarray], *samples: tuple[np.ndarray, np.ndarray], n: int
-) -> Estimate:
+) -> PlainEstimate:
     """A function of several means, each sample a pair (values, weights); weights drawn together keep samples paired."""
     point = float(function(*(np.mean(values) for values, _ in samples)))
     resampled = function(*(resampled_mean(values, weights) for values, weights in samples))
     return estimate(point, *_percentiles(resampled), np.std(resampled), n)
 
 
-def rate(successes: int, n: int) -> Estimate:
+def rate(successes: int, n: int) -> PlainEstimate:
     """Share of successes with the exact (Clopper-Pearson) interval: 0 of 20 is 0 % with an upper bound of 17 %.
 
     Over clips of unequal difficulty the interval errs on the wide side.
@@ -112,7 +112,7 @@ def rate(successes: int, n: int) -> Estimate:
     return estimate(share, interval.low, interval.high, np.sqrt(share * (1.0 - share)), n)
 
 
-def over_seeds(values: Sequence[float] | np.ndarray) -> Estimate:
+def over_seeds(values: Sequence[float] | np.ndarray) -> PlainEstimate:
     """Mean over training seeds with Student's t interval; one seed has no interval."""
     from scipy import stats  # half a second, which a command's --help does not wait for
 

@@ -11,7 +11,7 @@ from forgetmimic_jax.basics.errors import InputError, nearest
 from forgetmimic_jax.evaluation import metrics, statistics
 from forgetmimic_jax.evaluation.document import PolicyResult, policy_result
 from forgetmimic_jax.evaluation.metrics import BASE, ZERO_ACTION, Rollout
-from forgetmimic_jax.evaluation.statistics import Estimate
+from forgetmimic_jax.evaluation.statistics import PlainEstimate
 
 
 def evaluate_policies(
@@ -94,7 +94,7 @@ def _episodes_summary(
     members: np.ndarray,
     from_frame_0: np.ndarray,
     weights: np.ndarray,
-) -> dict[str, Estimate]:
+) -> dict[str, PlainEstimate]:
     """Every metric of one policy over the episodes bool[E] of whole clips."""
     weights = weights[:, members]
     summary = {

@@ -147,7 +147,7 @@ def add_numbers(
 
 def estimates(numbers: Mapping[str, np.ndarray], clip: np.ndarray, members: np.ndarray, seed: int) -> UnboundedNumbers:
     """Every number over the episodes bool[E] where it is defined."""
-    found: dict[str, statistics.Estimate] = {}
+    found: dict[str, statistics.PlainEstimate] = {}
     for name, every in numbers.items():
         defined = members & np.isfinite(every)
         if not defined.any():

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from forgetmimic_jax.evaluation.repeats import over_repeats
-from forgetmimic_jax.evaluation.statistics import Estimate
+from forgetmimic_jax.evaluation.statistics import PlainEstimate
 from forgetmimic_jax.evaluation.tables import markdown_table
 
 LEVEL = 0.05
@@ -55,7 +55,7 @@ class Between(NamedTuple):
     high: float
 
 
-def judged(value: Estimate, bound: float, *, below: bool = True) -> str:
+def judged(value: PlainEstimate, bound: float, *, below: bool = True) -> str:
     """Whether a number lies below (or above) its bound."""
     mean = value["mean"]
     if "low" not in value:
@@ -66,7 +66,7 @@ def judged(value: Estimate, bound: float, *, below: bool = True) -> str:
     return FAILS if ((low >= bound) if below else (high <= bound)) else OPEN
 
 
-def p_value(value: Estimate, bound: float) -> float | None:
+def p_value(value: PlainEstimate, bound: float) -> float | None:
     """Two-sided p-value of `mean = bound`, from the same distribution as the 95 % interval; None for one unit.
 
     An interval excludes the bound where this is under 0.05.
@@ -87,7 +87,7 @@ def p_value(value: Estimate, bound: float) -> float | None:
 
 
 def finding(
-    claim: str, value: Estimate, bound: float, evidence: str, *, below: bool = True, main: bool = False
+    claim: str, value: PlainEstimate, bound: float, evidence: str, *, below: bool = True, main: bool = False
 ) -> Finding:
     """A claim that a number lies below (or above) a bound."""
     return Finding(claim, judged(value, bound, below=below), evidence, value["n"], p_value(value, bound), main)

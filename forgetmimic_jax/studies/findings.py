@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from forgetmimic_jax.evaluation.repeats import over_repeats
-from forgetmimic_jax.evaluation.statistics import Estimate
+from forgetmimic_jax.evaluation.statistics import PlainEstimate
 from forgetmimic_jax.evaluation.tables import FORGOTTEN, percent
 from forgetmimic_jax.studies.claim import Finding, finding
 from forgetmimic_jax.studies.variants import estimates, gained, within
@@ -42,7 +42,9 @@ def kept_stay(
         yield finding(claim, change, -POINTS, evidence, below=False, main=main)
 
 
-def mean_gained(variants: Mapping[str, Any], label: str, other: str | None, group: str, metric: str) -> Estimate | None:
+def mean_gained(
+    variants: Mapping[str, Any], label: str, other: str | None, group: str, metric: str
+) -> PlainEstimate | None:
     """A variant's number minus another's of the same repeat, or minus the base's; None where none has both."""
     found = gained(variants, label, other, group, metric)
     return over_repeats(found) if found else None

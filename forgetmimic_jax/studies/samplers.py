@@ -9,7 +9,7 @@ import numpy as np
 
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.evaluation.repeats import over_repeats
-from forgetmimic_jax.evaluation.statistics import Estimate
+from forgetmimic_jax.evaluation.statistics import PlainEstimate
 from forgetmimic_jax.evaluation.tables import number
 from forgetmimic_jax.studies import paper
 from forgetmimic_jax.studies.claim import Finding, finding
@@ -82,7 +82,7 @@ def findings(variants: Mapping[str, Any], prefix: str = "", *, main: bool = Fals
                 yield finding(claim, change, 0.0, evidence, below=group == "kept", main=main)
 
 
-def effect(variants: Mapping[str, Any], pairs: Sequence[tuple[str, str]], group: str) -> Estimate | None:
+def effect(variants: Mapping[str, Any], pairs: Sequence[tuple[str, str]], group: str) -> PlainEstimate | None:
     """What one switch changes in tracking, mean over what else is set; None where no repeat has all.
 
     Args:
