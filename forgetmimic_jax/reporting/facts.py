@@ -38,6 +38,7 @@ def done(subject: Subject) -> dict[str, str]:
     module = importlib.import_module(f"{unlearning.__name__}.{config.unlearn.method}")
     facts = {"Method": f"{config.unlearn.method}: {str(module.__doc__).splitlines()[0]}"}
     facts |= {name.capitalize(): f"{value:g}" for name, value in config.unlearn.settings.items()}
+    keep = config.unlearn.settings.get("keep", config.ppo.base_kl)  # of a method with a weight of its own
     settles = f"; {KEEP:g} times that while the run settles" if config.unlearn.stop_every else ""
     steps = document.budget.get(UNLEARNED, {}).get("environment_steps", subject.info.environment_steps)
     return facts | {
@@ -49,7 +50,7 @@ def done(subject: Subject) -> dict[str, str]:
         "Sampler": _sampler(config.sampling),
         "Assistive wrench": f"up to {config.wrench.max_gain:g}" if config.wrench.max_gain else "off",
         "Weights in PPO's losses": "the same for every clip" if config.ppo.equal_clips else "the same for every step",
-        "KL to the base": f"weight {config.ppo.base_kl:g}, on kept clips{settles}"
+        "KL to the base": f"weight {keep:g}, on kept clips{settles}"
         if subject.rows and "base_kl" in subject.rows[-1]  # some methods' losses have none
         else "off",
         "Step size": f"{config.ppo.learning_rate:g}, {config.ppo.schedule}",

@@ -17,6 +17,8 @@ from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.basics.provenance import provenance
 from forgetmimic_jax.evaluation.verdict import RULES
 from forgetmimic_jax.reporting import films
+from forgetmimic_jax.reporting.facts import done
+from forgetmimic_jax.reporting.subject import read_subject
 from forgetmimic_jax.settings.config import load_config
 from forgetmimic_jax.settings.options import override, parse
 from forgetmimic_jax.training.checkpoint import policy_hash, read_info
@@ -159,6 +161,14 @@ def test_the_facts_lie_beside_it(facts, run):
     assert facts["done"]["Penalty"] == "16"
     assert facts["done"]["Sampler"] == "uniform clips, starts from all clips, 50% on the targets"
     assert facts["done"]["KL to the base"] == "weight 0.1, on kept clips; 4 times that while the run settles"
+
+
+def test_a_method_with_a_weight_of_its_own_for_the_kept_clips_is_told_with_it(run):
+    subject = read_subject(run, None)
+    stand = dataclasses.replace(subject.info.config.unlearn, method="stand", settings={"keep": 3.0}, stop_every=0)
+    config = dataclasses.replace(subject.info.config, unlearn=stand)
+    told = done(dataclasses.replace(subject, info=dataclasses.replace(subject.info, config=config)))
+    assert told["KL to the base"] == "weight 3, on kept clips"
 
 
 def test_the_command_that_reproduces_it_gives_the_runs_settings(facts, run):
