@@ -7,6 +7,9 @@ cases of a family in a process of their own, because a file may also crash the r
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import functools
+import hashlib
 import io
 import json
 import os
@@ -22,20 +25,39 @@ import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
+import jax
 import msgspec
 import numpy as np
+from commands.miniature import TINY, started
 from conftest import SHARED, invented_clip
 
-from forgetmimic_jax import evaluate, export, play, pretrain, report, sweep, train, unlearn, video
-from forgetmimic_jax.basics.errors import run_command
+from forgetmimic_jax import (
+    bench,
+    evaluate,
+    evidence,
+    export,
+    import_policy,
+    motions,
+    play,
+    pretrain,
+    report,
+    robots,
+    sweep,
+    train,
+    unlearn,
+    video,
+)
+from forgetmimic_jax.basics.errors import InputError, run_command
 from forgetmimic_jax.exchange.foreign import Reading as PolicyReading
 from forgetmimic_jax.exchange.foreign import read_policy
+from forgetmimic_jax.exchange.rsl_rl import read_rsl_rl
 from forgetmimic_jax.motion.clip import write_clip
 from forgetmimic_jax.motion.importing import import_motion
 from forgetmimic_jax.motion.library import build_library, file_hash, read_library
 from forgetmimic_jax.motion.recording import Reading
+from forgetmimic_jax.ppo.state import TrainState
 from forgetmimic_jax.robot.model import ROBOTS_DIR, load_robot
-from forgetmimic_jax.settings.config import load_config
+from forgetmimic_jax.settings.config import load_config, preset
 from forgetmimic_jax.settings.options import override, parse
 from forgetmimic_jax.tracking.setup import make_setup
 from forgetmimic_jax.training import checkpoint
@@ -44,9 +66,11 @@ from forgetmimic_jax.training.start import base_folder
 LIMIT = 120  # s for one file, on a busy machine; a reader that needs longer hangs
 WORDS = ("", "nan", "inf", "-1", "0", "1e308", "99999999999", "null", "[]", "{}", "!!python/object/apply:os.abort []")
 COMMANDS = {
-    "train": train, "unlearn": unlearn, "evaluate": evaluate, "export": export, "play": play, "pretrain": pretrain,
-    "report": report, "sweep": sweep, "video": video,
+    "train": train, "unlearn": unlearn, "evaluate": evaluate, "evidence": evidence, "export": export, "play": play,
+    "pretrain": pretrain, "report": report, "sweep": sweep, "video": video, "bench": bench,
+    "import-policy": import_policy, "motions": motions, "robot": robots,
 }  # fmt: skip
+SUBCOMMANDS = {"motions": ("import", "retarget", "check", "show", "list"), "robot": ("check", "add")}
 
 
 class Code:
@@ -99,12 +123,36 @@ def mutate_file(path: Path, rng: random.Random) -> None:
         path.write_bytes(mutated(path.read_bytes(), rng))
 
 
+def half_written(folder: Path) -> list[str]:
+    """What is wrong with the files of a folder that a command wrote, or was writing."""
+    faults = []
+    for path in sorted(folder.rglob("*.json")):
+        parts = path.relative_to(folder).parts
+        orbax = checkpoint.RUN in parts[parts.index("checkpoints") :] if "checkpoints" in parts else False
+        if orbax or any(part.startswith(".") for part in parts):
+            continue  # orbax's files are listed with the others of a checkpoint; what is being written is hidden
+        try:
+            content = json.loads(path.read_text())
+        except ValueError as error:
+            faults.append(f"{path}: {error}")
+            continue
+        listed = content.get("files", {}) if path.name == checkpoint.META else {}
+        if path.name == "manifest.json":
+            listed = {f"{name}.npz": clip["sha256"] for name, clip in content["clips"].items()}
+        for name, digest in listed.items():
+            file = path.parent / name
+            found = hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else "missing"
+            if not found.startswith(digest):
+                faults.append(f"{file}: {found}, not {digest}")
+    return faults
+
+
 # A family: (folder) → the files to mutate there, and what reads them.
 Family = Callable[[Path], tuple[list[Path], Callable[[], object]]]
 
 
 def _motion(folder: Path, name: str) -> tuple[list[Path], Callable[[], object]]:
-    """A motion file, which is read as `motions import` reads it."""
+    """A motion file, which `motions import` adds to a library or refuses before it writes anything."""
     robot, path = load_robot("g1"), folder / name
     if name == "motion.csv":
         clip = invented_clip(robot, "turn", 41, 1.0, 0.2)
@@ -112,8 +160,19 @@ def _motion(folder: Path, name: str) -> tuple[list[Path], Callable[[], object]]:
         np.savetxt(path, rows, delimiter=",", fmt="%.6f")
     else:
         shutil.copyfile(SHARED / "motions" / name, path)
-    fps = 30.0 if path.suffix == ".csv" else None
-    return [path], lambda: import_motion(robot, path, Reading(fps=fps, end=1.0))
+    fps, library = 30.0 if path.suffix == ".csv" else None, folder / "library"
+    options = motions.Options(motions.Import(path, fps=fps, end=1.0, library=library))
+
+    def read() -> None:
+        try:
+            motions.main(options)
+        except InputError:
+            assert not library.exists(), "it was refused after something was written"
+            raise
+        finally:
+            assert not half_written(library), half_written(library)
+
+    return [path], read
 
 
 def _library(folder: Path) -> tuple[list[Path], Callable[[], object]]:
@@ -161,6 +220,37 @@ def _checkpoint(folder: Path) -> tuple[list[Path], Callable[[], object]]:
     return files, read
 
 
+@functools.cache
+def _state() -> tuple[checkpoint.CheckpointInfo, TrainState]:
+    """A checkpoint that a run can continue from, and the shapes of its state."""
+    folder = Path(tempfile.mkdtemp(prefix="forgetmimic-soak-"))
+    setup = make_setup(override(preset("cpu"), TINY))
+    state = started(setup)
+    checkpoint.save_checkpoint(folder / "00000000", setup, state, checkpoint.Progress(0, 0))
+    return checkpoint.read_info(folder / "00000000"), jax.eval_shape(lambda: state)
+
+
+def _run_part(folder: Path) -> tuple[list[Path], Callable[[], object]]:
+    """The part of a checkpoint from which a run continues; its hashes follow the mutation."""
+    info, shapes = _state()
+    path = Path(shutil.copytree(info.path, folder / "00000000"))
+    files = [file for file in sorted((path / checkpoint.RUN).rglob("*")) if file.is_file()]
+
+    def read() -> None:
+        meta = json.loads((path / checkpoint.META).read_text())
+        meta["files"] = {name: file_hash(path / name) for name in meta["files"]}
+        (path / checkpoint.META).write_text(json.dumps(meta))
+        checkpoint.load_state(checkpoint.read_info(path), shapes)
+
+    return files, read
+
+
+def _pt(folder: Path) -> tuple[list[Path], Callable[[], object]]:
+    """A policy of rsl_rl; the small one is none of the robot's, so only its tensors are read."""
+    path = Path(shutil.copyfile(Path(__file__).parent / "exchange" / "rsl_rl" / "rsl_rl_5.5.1.pt", folder / "model.pt"))
+    return [path], lambda: read_rsl_rl(path, "elu")
+
+
 def _policy(folder: Path, name: str) -> tuple[list[Path], Callable[[], object]]:
     """A policy of another project, which is read as `import-policy` reads it."""
     source = SHARED / "policies" / name
@@ -177,7 +267,9 @@ FAMILIES: dict[str, Family] = {
     "robot": _robot,
     "config": _config,
     "checkpoint": _checkpoint,
+    "run": _run_part,
     "onnx": lambda folder: _policy(folder, "wbc_39eff8a/policy.onnx"),
+    "pt": _pt,
     "deploy": lambda folder: _policy(folder, "unitree_rl_lab_dance_102/policy.onnx"),
 }
 
@@ -186,8 +278,11 @@ def flags(rng: random.Random) -> None:
     """A command line of random flags, and random settings."""
     name = rng.choice(sorted(COMMANDS))
     options = COMMANDS[name].Options
-    known = [f"--{field.replace('_', '-')}" for field in options.__annotations__]
-    words = [rng.choice([*known, *WORDS, "lambda", "punch", "../..", "ppo.epochs=x", "a=b"]) for _ in range(4)]
+    known = [f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(options)]
+    words = [
+        rng.choice([*known, *SUBCOMMANDS.get(name, ()), *WORDS, "lambda", "punch", "../..", "ppo.epochs=x", "a=b"])
+        for _ in range(4)
+    ]
     parse(options, name, words)
     settings = by_sections(load_config(base_folder("g1") / "config.yaml"))
     override(load_config(base_folder("g1") / "config.yaml"), [f"{rng.choice(settings)}={rng.choice(WORDS)}"])

@@ -10,8 +10,8 @@ random: policies with random weights of random size train for hours. No NaN in a
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
-import hashlib
 import json
 import os
 import random
@@ -30,7 +30,7 @@ import jax
 import numpy as np
 from commands.miniature import TINY
 from conftest import SWAY_FRAMES, TURN_FRAMES, invented_clip
-from mutations import FAMILIES
+from mutations import FAMILIES, half_written
 
 from forgetmimic_jax.basics.files import read_rows
 from forgetmimic_jax.motion.clip import write_clip
@@ -41,7 +41,7 @@ from forgetmimic_jax.settings.config import preset
 from forgetmimic_jax.settings.options import override, replace_given
 from forgetmimic_jax.tracking.env import Assets, make_assets, make_environment
 from forgetmimic_jax.tracking.setup import make_setup
-from forgetmimic_jax.training.checkpoint import META, POLICY, newest_checkpoint
+from forgetmimic_jax.training.checkpoint import POLICY, newest_checkpoint
 from forgetmimic_jax.training.run import make_iteration
 from forgetmimic_jax.unlearning.registry import method_of
 
@@ -122,27 +122,17 @@ def imported(folder: Path) -> Any:
     return {path.name: file_hash(path) for path in folder.glob("*.npz")}
 
 
-def half_written(folder: Path) -> list[str]:
-    """What is wrong with the files of a folder."""
-    faults = []
-    for path in sorted(folder.rglob("*.json")):
-        hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
-        if hidden or "run" in path.relative_to(folder).parts:
-            continue  # what is being written is hidden, and orbax's files are checked with the others of a checkpoint
-        try:
-            content = json.loads(path.read_text())
-        except ValueError as error:
-            faults.append(f"{path}: {error}")
-            continue
-        listed = content.get("files", {}) if path.name == META else {}
-        if path.name == "manifest.json":
-            listed = {f"{name}.npz": clip["sha256"] for name, clip in content["clips"].items()}
-        for name, digest in listed.items():
-            file = path.parent / name
-            found = hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else "missing"
-            if not found.startswith(digest):
-                faults.append(f"{file}: {found}, not {digest}")
-    return faults
+def saved(folder: Path) -> dict[Path, int]:
+    """What a later start must not lose: the newest checkpoint's iteration of each run, and every finished attack."""
+    newest = {path: newest_checkpoint(path) for path in (folder, folder / "run-control")}
+    attacks = {path: 1 for path in folder.glob("run/evidence/*.json")}
+    return {path: int(checkpoint.name) for path, checkpoint in newest.items() if checkpoint} | attacks
+
+
+def lost(before: dict[Path, int], after: dict[Path, int]) -> list[str]:
+    """A fault for everything that was saved before and is no longer there, or is older."""
+    return [f"{path}: {value} was saved, now {after.get(path)}" for path, value in before.items()
+            if after.get(path, -1) < value]  # fmt: skip
 
 
 def scenes(folder: Path, wanted: Collection[str]) -> dict[str, Scene]:
@@ -201,7 +191,11 @@ def wait_for_a_file(process: subprocess.Popen, folder: Path) -> None:
     """Wait until a process writes into a folder, or ends."""
 
     def seen() -> dict[str, int]:
-        return {path.name: path.stat().st_mtime_ns for path in (folder, *folder.glob("*")) if path.exists()}
+        times = {}
+        for path in (folder, *folder.rglob("*")):
+            with contextlib.suppress(FileNotFoundError):  # it was removed since it was listed
+                times[str(path)] = path.stat().st_mtime_ns
+        return times
 
     before = seen()
     while process.poll() is None and seen() == before:
@@ -213,6 +207,7 @@ def kill(scene: Scene, folder: Path, times: int, rng: random.Random) -> list[str
     wanted, before, span = undisturbed(scene, folder / "undisturbed")
     output, faults, killed = folder / "killed", [], 0
     while killed < times:
+        before_start = saved(output)
         process = scene.start(output)
         wait = rng.uniform(0.0, before + span)
         if rng.random() >= AT_START:
@@ -224,7 +219,7 @@ def kill(scene: Scene, folder: Path, times: int, rng: random.Random) -> list[str
             process.send_signal(signal.SIGKILL)
             killed += 1
         said, code = finish(process)
-        faults += half_written(output)
+        faults += half_written(output) + lost(before_start, saved(output))
         if code == 0:
             if scene.result(output) != wanted:
                 faults.append("the result differs from that of a run that was not killed")
@@ -241,11 +236,11 @@ def kill(scene: Scene, folder: Path, times: int, rng: random.Random) -> list[str
 def fill(scene: Scene, folder: Path, times: int, rng: random.Random) -> list[str]:
     """Run a command on disks that become full; then it continues on a larger one. Returns the faults."""
     wanted, *_ = undisturbed(scene, folder / "undisturbed")
-    needed = sum(path.stat().st_size for path in (folder / "undisturbed").rglob("*") if path.is_file())
+    needed, given = _pages(folder / "undisturbed"), _pages(scene.run) if scene.run else 0
     faults, disk = [], folder / "disk"
     disk.mkdir()
     for _ in range(times):
-        size = rng.randrange(PAGE, needed)
+        size = given + rng.randrange(PAGE, needed - given)  # a run that the command adds to fits
         subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "none", str(disk)], check=True)
         try:
             output = disk / "output"
@@ -257,12 +252,19 @@ def fill(scene: Scene, folder: Path, times: int, rng: random.Random) -> list[str
             faults += [f"{size} bytes: {fault}" for fault in half_written(output)]
             subprocess.run(["mount", "-o", f"remount,size={TMPFS}", str(disk)], check=True)
             if code != 0:
+                before_start = saved(output)
                 said, code = finish(scene.start(output))
+                faults += lost(before_start, saved(output))
             if code != 0 or scene.result(output) != wanted:
                 faults.append(f"{size} bytes, then more: exit code {code}: {said[-300:]}")
         finally:
             subprocess.run(["umount", str(disk)], check=True)
     return faults
+
+
+def _pages(folder: Path) -> int:
+    """Bytes that a folder takes on a disk of pages."""
+    return sum(-(-path.stat().st_size // PAGE) * PAGE + PAGE for path in folder.rglob("*"))
 
 
 def inputs(family: str, times: int, keep: Path) -> list[str]:
