@@ -708,6 +708,10 @@ MUTANTS = (
            "The page forgets a fall when the robot gets up.",
            "if falls and self.fell[policy] is None:",
            "if falls:"),
+    Mutant("evidence_below", "forgetmimic_jax/attacks/verdict.py", "tests/attacks/test_evidence_verdict.py",
+           "A policy that falls on purpose on a target passes for a retrained one.",
+           "    doubts += _over_forgotten(originals.targets)\n",
+           ""),
     # Several processes: all go the way of the first.
     Mutant("agreed_alone", "forgetmimic_jax/training/devices.py", "tests/commands/test_devices.py",
            "Every process ends where its own evaluation says, and waits for ever for the others.",

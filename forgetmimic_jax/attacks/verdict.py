@@ -74,7 +74,10 @@ RULES = {
         "other side of its bound with its whole interval, or with every seed. The reasons name the attack and by how "
         "much."
     ),
-    INCONCLUSIVE: "None of the other rules holds: an interval includes a bound, or a comparison was not measured.",
+    INCONCLUSIVE: (
+        "None of the other rules holds: an interval includes a bound, a comparison was not measured, or the policy is "
+        "below the zero-action baseline on a target, with its whole interval: no retrained policy is."
+    ),
     FAILED: "With its whole interval a number of 'forgotten' or of 'kept' is on the other side of all of its bounds.",
 }
 
@@ -103,6 +106,7 @@ def judge(evidence: EvidenceDocument) -> Verdict:
             doubts.append(f"Whether this is kept is not sure: near-duplicates of the kept clips: {family}, {words}.")
     if not any(as_skill(numbers.skill) for _, numbers in _numbers(originals.targets)):
         doubts.append(_NO_SKILL.format("target"))
+    doubts += _over_forgotten(originals.targets)
     if near is None:
         doubts.append("Near-duplicates were not measured.")
     if failures:
@@ -245,21 +249,20 @@ def _control_is_usable(evidence: EvidenceDocument) -> str:
     return f"The control retains {together} of the kept clips' skill on average; a control needs {_bound(KEPT)}."
 
 
+def _over_forgotten(targets: Marks) -> list[str]:
+    """A doubt where a target is below the zero-action baseline: no retrained policy is."""
+    below = [f"{clip} {skill}" for clip, skill in _skills(targets).items() if skill.high < 0.0]
+    if not below:
+        return []
+    return [f"Over-forgotten: below the zero-action baseline ({', '.join(below)} of the base's skill)."]
+
+
 def _remarks(evidence: EvidenceDocument) -> list[str]:
     """What no rule decides, but a reader should know."""
-    remarks = []
-    below = {
-        name: skill
-        for name, numbers in _numbers(evidence.originals.targets)
-        if (skill := as_skill(numbers.skill)) and skill.high < 0.0
-    }
-    if below:
-        listed = ", ".join(f"{clip} {skill}" for clip, skill in below.items())
-        remarks.append(f"Over-forgotten: below the zero-action baseline ({listed} of the base's skill).")
     near = evidence.near_duplicates
-    if near is not None and near.dropped:
-        remarks.append(f"{len(near.dropped)} near-duplicates were dropped, since the base cannot follow them.")
-    return remarks
+    if near is None or not near.dropped:
+        return []
+    return [f"{len(near.dropped)} near-duplicates were dropped, since the base cannot follow them."]
 
 
 def _numbers(marks: Marks) -> Iterator[tuple[str, Numbers]]:

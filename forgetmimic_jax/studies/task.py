@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from forgetmimic_jax.basics.drawing import draw_later
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.basics.files import read_rows, write_atomically
 from forgetmimic_jax.basics.provenance import PACKAGE, provenance
@@ -87,6 +88,7 @@ def run_task(
     Returns:
         None where the task is finished now, otherwise why it is not.
     """
+    draw_later()  # a worker of a cluster may have no library to draw with
     try:
         _check_worker(task, directory, code)
         with _marked(task):

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -34,6 +35,23 @@ def test_a_library_that_is_missing_breaks_no_command(library):
     assert (listed.returncode, listed.stderr) == (0, "")
     done = subprocess.run([sys.executable, "-c", IMPORTS], env=environment, capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (0, "ready\n", "")
+
+
+WORKER = """
+from pathlib import Path
+from forgetmimic_jax.basics.provenance import provenance
+from forgetmimic_jax.studies.task import Task, run_task
+print(run_task(Task(Path("trial").resolve(), "report", (), 1), Path.cwd(), provenance().code, 1))
+"""
+
+
+@pytest.mark.parametrize("program", [("-m", "experiments.claims", "--help"), ("-c", WORKER)])
+def test_it_breaks_no_study_and_no_worker_of_a_cluster(program, tmp_path):
+    environment = os.environ | {"MUJOCO_GL": "nonsense", "PYTHONPATH": str(Path(__file__).parents[2])}
+    environment.pop(CHOICE, None)
+    done = subprocess.run([sys.executable, *program], env=environment, capture_output=True, text=True, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "MUJOCO_GL" not in done.stdout
 
 
 def test_what_draws_still_knows_the_users_choice(monkeypatch):
