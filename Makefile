@@ -16,13 +16,15 @@
 ## WITHOUT      clips that pretrain leaves out, comma-separated, which makes a retrained control (default: none)
 ## CHECKPOINT   the policy to evaluate, export, play or film (default: the shipped base; to play or film, all shipped)
 ## BESIDE       more checkpoints to play or film beside it, comma-separated
-## RUN          folder of the run to attack, or to report on
+## RUN          folder of the run to attack, or to report on; to attack several, comma-separated
 ## OUTPUT       where the results go (default: under runs/)
 ## NOISE        1 evaluates with randomisation, pushes and sensor noise
 ## RESUME       1 continues the run in OUTPUT
 ## SWEEP        lambda, targets, sampler or seeds (default: lambda)
 ## DEVICES      devices that share one training, such as 4; for bench the numbers to compare, such as 1,2,4 (default: 1)
-## CLUSTER      address of a dask scheduler whose workers run the trials of sweep and experiments (default: none)
+## SEEDS        runs of each kind for sweep and experiments; for pretrain so many trainings, each in a folder of its own
+## JOBS         of these, so many at a time on this machine
+## CLUSTER      address of a dask scheduler whose workers run them (docs/cluster.md; default: none)
 ## ARGS         flags as they are, and what comes before them; ARGS=--help lists all flags
 ## PYTHON       the Python that .venv is made from, 3.11 to 3.14 (default: the first found)
 PROGRAM = .venv/bin/python -m forgetmimic_jax

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from forgetmimic_jax.basics.errors import InputError, Interrupted, run_command
-from forgetmimic_jax.settings.options import at_least, parse
+from forgetmimic_jax.settings.options import at_least, comma_separated, flags_of, parse
 
 if TYPE_CHECKING:
     from forgetmimic_jax.attacks.case import Case, Scale
@@ -27,7 +28,8 @@ class Options:
     """
 
     run: Path
-    """Folder of the run."""
+    """Folder of the run. Several, comma-separated, are attacked side by side; those that have an evidence.json already
+    are left as they are."""
     control: Path | None = None
     """Run of METHOD=distill or retrain with the same base and targets, or of `make pretrain WITHOUT=TARGETS`;
     RUN-control by default, which is distilled if it is missing."""
@@ -45,6 +47,10 @@ class Options:
     """Iterations of a control that is made; the method's by default."""
     fakes: bool = False
     """Judge the judge too: six fakes, which must fail, and another distilled policy, which must not (an hour)."""
+    jobs: int = 1
+    """With several runs, so many at a time on this machine; they share its cores evenly."""
+    cluster: str | None = None
+    """Address of a dask scheduler, such as tcp://host:8786, whose workers attack the runs (docs/cluster.md)."""
 
 
 def main(options: Options) -> None:
@@ -70,17 +76,13 @@ def main(options: Options) -> None:
     from forgetmimic_jax.tracking.setup import library_folder
     from forgetmimic_jax.training import checkpoint
     from forgetmimic_jax.training.comparison import load_comparison
-    from forgetmimic_jax.training.folder import check_writable
 
     provenance()  # of the code that is loaded now; a checkout may change while attacks train
-    run, scale = options.run, _scale(options)
-    newest = checkpoint.newest_checkpoint(run)
-    if newest is None:
-        raise InputError(f"{run}: no run with a checkpoint")
-    info = checkpoint.read_info(newest)
-    if not info.config.unlearn.targets:
-        raise InputError(f"{newest}: no clip was to be forgotten; accepted: a run of `make unlearn`")
-    check_writable(run)
+    scale, runs = _scale(options), [Path(name) for name in comma_separated(str(options.run))]
+    if len(runs) > 1 or options.cluster:
+        return _several(options, runs)
+    run = options.run
+    newest, info = _unlearned(run)
     compared = load_comparison(newest, robot=info.robot, base=options.base)
     setup, base = compared.setup, compared.info["base"]
     beside = options.control or control.beside(run)
@@ -116,7 +118,8 @@ def main(options: Options) -> None:
     save(draw(document), files["figure"])
     if options.fakes:
         _judge_fakes(options, case, parts, document, info, base.path)
-    given = {field.name: getattr(options, field.name) or None for field in dataclasses.fields(options)}
+    names = [field.name for field in dataclasses.fields(options) if field.name not in ("jobs", "cluster")]
+    given = {name: getattr(options, name) or None for name in names}
     command = command_line("evidence", **given)
     text = page(document, files["figure"].name, command, read_judged(run / JUDGED))
     write_atomically(files["page"], text.encode())
@@ -124,6 +127,38 @@ def main(options: Options) -> None:
     console = Console()
     console.print(f"{verdict.phrase}: {' '.join(verdict.reasons)}", highlight=False, markup=False, soft_wrap=True)
     closing(files, command_line("report", run=run))
+
+
+def _unlearned(run: Path) -> tuple[Path, CheckpointInfo]:
+    """The newest checkpoint of an unlearning run, and what it says of itself."""
+    from forgetmimic_jax.training import checkpoint
+    from forgetmimic_jax.training.folder import check_writable
+
+    newest = checkpoint.newest_checkpoint(run)
+    if newest is None:
+        raise InputError(f"{run}: no run with a checkpoint")
+    info = checkpoint.read_info(newest)
+    if not info.config.unlearn.targets:
+        raise InputError(f"{newest}: no clip was to be forgotten; accepted: a run of `make unlearn`")
+    check_writable(run)
+    return newest, info
+
+
+def _several(options: Options, runs: Sequence[Path]) -> None:
+    """The evidence on each run, in a process of its own."""
+    from forgetmimic_jax.attacks.document import FILE
+    from forgetmimic_jax.basics.console import command_line
+    from forgetmimic_jax.studies.executor import run_together
+    from forgetmimic_jax.studies.task import Task
+
+    at_least(1, "--jobs", options.jobs)
+    tasks = []
+    for run in runs:
+        _unlearned(run)
+        flags = flags_of(dataclasses.replace(options, run=run, jobs=1, cluster=None))
+        tasks.append(Task(run, "evidence", flags, iterations=0, last=FILE, adds=True))
+    following = command_line("report", run=runs[0])
+    run_together(tasks, following, description="evidence", jobs=options.jobs, cluster=options.cluster)
 
 
 def _scale(options: Options) -> Scale:

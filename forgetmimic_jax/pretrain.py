@@ -13,8 +13,10 @@ from forgetmimic_jax.basics.errors import InputError, run_command
 from forgetmimic_jax.settings.config import Config, UnlearnConfig
 from forgetmimic_jax.settings.options import (
     Settings,
+    at_least,
     check_same,
     comma_separated,
+    flags_of,
     on_engine,
     override,
     parse,
@@ -54,18 +56,34 @@ class Options(train.Options):
     without: str | None = None
     """Clips to leave out, comma-separated: from a random policy, without an episode of these clips. The result is the
     retrained control of a run that forgets them (evidence, report and the studies: --control)."""
+    episodes: int = 100
+    """Episodes a clip of the evaluation at the end."""
+    seeds: int | None = None
+    """Train so many policies, with the seeds SEED, SEED + 1, ..., each in the folder OUTPUT-ITS_SEED. The same command
+    continues those that were stopped."""
+    jobs: int = 1
+    """With --seeds, trainings at a time on this machine; they share its cores evenly."""
+    cluster: str | None = None
+    """With --seeds, address of a dask scheduler, such as tcp://host:8786, whose workers train (docs/cluster.md)."""
 
 
 def main(options: Options) -> None:
-    """Pretrain, and say where the policy is."""
+    """Pretrain, evaluate, and say where the policy is."""
     from forgetmimic_jax.basics.console import closing, command_line
+    from forgetmimic_jax.evaluation.evaluate import evaluate, show_and_write
     from forgetmimic_jax.tracking.setup import make_setup
+    from forgetmimic_jax.training.checkpoint import load_policy, read_info
+    from forgetmimic_jax.training.comparison import subject
     from forgetmimic_jax.training.devices import join, own_folder
     from forgetmimic_jax.training.folder import BEST, prepare_folder
     from forgetmimic_jax.training.pretraining import Pretraining
     from forgetmimic_jax.training.run import run
 
     output = options.output or Path("runs") / f"pretrain-{options.robot}{'-control' if options.without else ''}"
+    at_least(1, "--episodes", options.episodes)
+    if options.seeds is not None:
+        return _several(options, output)
+    check_alone(options)
     prepare_folder(output, resume=options.resume)
     config = config_of(options, output)
     join(config)
@@ -75,9 +93,47 @@ def main(options: Options) -> None:
         warn_of_infeasible(setup)
     path, _ = run(setup, output, description=f"pretrain {config.robot}", resume=options.resume, make_course=Pretraining)
     best = output / BEST if (output / BEST).is_dir() else path
-    files = {"policy": best, "clips over time": output / "evaluations.png"}
-    files |= {"curves": output / "metrics.jsonl", "TensorBoard": output / "events"}
-    closing(files, command_line("evaluate", robot=config.robot, checkpoint=best, episodes=100))
+    info, targets = read_info(best), config.unlearn.targets
+    evaluated = {"retrained" if targets else "base": subject(load_policy(info, setup.robot), info)}
+    document = evaluate(
+        setup, evaluated, checkpoint=str(best), targets=targets, episodes=options.episodes, seed=config.seed
+    )
+    files = {"policy": best, **show_and_write(output, document)}
+    files |= {"clips over time": output / "evaluations.png", "curves": output / "metrics.jsonl"}
+    closing(files | {"TensorBoard": output / "events"}, command_line("play", robot=config.robot, checkpoint=best))
+
+
+def _several(options: Options, output: Path) -> None:
+    """A training of each seed, in a process of its own."""
+    from forgetmimic_jax.basics.console import command_line
+    from forgetmimic_jax.studies.executor import run_together
+    from forgetmimic_jax.studies.task import Task
+    from forgetmimic_jax.training.folder import check_writable
+
+    assert options.seeds is not None
+    at_least(1, "--seeds", options.seeds)
+    at_least(1, "--jobs", options.jobs)
+    if options.resume:
+        raise InputError("--resume: found with --seeds; leave it out: the same command continues what was stopped")
+    check_writable(output)
+    alone = dataclasses.replace(options, seeds=None, jobs=1, cluster=None, output=None)
+    first, tasks = options.seed or 0, []
+    for seed in range(first, first + options.seeds):
+        one, folder = dataclasses.replace(alone, seed=seed), output.with_name(f"{output.name}-{seed}")
+        config = config_of(one, folder)
+        if config.base and options.base:
+            one = dataclasses.replace(one, base=Path(config.base))  # the checkpoint that a run's folder stands for
+        tasks.append(Task(folder, "pretrain", flags_of(one), config.iterations))
+    following = command_line("evaluate", robot=options.robot, checkpoint=tasks[0].folder)
+    what = f"pretrain {options.robot}"
+    run_together(tasks, following, description=what, jobs=options.jobs, cluster=options.cluster)
+
+
+def check_alone(options: Options) -> None:
+    """InputError for a flag that only several trainings have."""
+    for name in ("jobs", "cluster"):
+        if getattr(options, name) != getattr(Options, name):
+            raise InputError(f"--{name}: found {getattr(options, name)}; accepted: only with --seeds")
 
 
 def config_of(options: Options, output: Path) -> Config:

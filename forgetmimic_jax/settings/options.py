@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -24,6 +25,19 @@ Settings = Annotated[list[list[str]], tyro.conf.UseAppendAction, tyro.conf.arg(m
 def parse(options: type[T], command: str, arguments: Sequence[str] | None = None) -> T:
     """The command line, or `arguments`, as `options`; an unknown flag or a wrong value ends it with exit code 2."""
     return tyro.cli(options, prog=f"forgetmimic {command}", args=arguments, config=(tyro.conf.FlagCreatePairsOff,))
+
+
+def flags_of(options: Any) -> tuple[str, ...]:
+    """The command line of those options that are not the defaults."""
+    flags: list[str] = []
+    for option in dataclasses.fields(options):
+        value, default = getattr(options, option.name), option.default
+        if option.name == "set":
+            value, default = list(itertools.chain(*value)), []
+        if value != default:
+            values = value if isinstance(value, list) else [] if value is True else [value]
+            flags += [f"--{option.name.replace('_', '-')}", *map(str, values)]
+    return tuple(flags)
 
 
 def check_same(options: Any, saved: dict[str, Any]) -> None:

@@ -10,11 +10,13 @@ import contextlib
 import dataclasses
 import functools
 import signal
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from forgetmimic_jax.basics.console import closing
 from forgetmimic_jax.basics.errors import InputError, Interrupted
 from forgetmimic_jax.basics.provenance import cores, provenance
 from forgetmimic_jax.studies.board import board
@@ -72,6 +74,21 @@ def run_tasks(tasks: Sequence[Task], *, jobs: int, cluster: str | None = None, d
                 if running:
                     place.stop([_absolute(futures[future]).folder for future in running])
     return failed
+
+
+def run_together(tasks: Sequence[Task], next_command: str, **given: Any) -> None:
+    """`run_tasks` as a command's whole work: says where each task's folder is, and ends with exit code 1 if one failed.
+
+    Args:
+        tasks: one for each folder.
+        next_command: to try then.
+        given: the other arguments of `run_tasks`.
+    """
+    failed = run_tasks(tasks, **given)
+    closing({task.folder.name: task.folder for task in tasks if task not in failed}, next_command)
+    if failed:
+        print(f"{len(failed)} of {len(tasks)} failed; the same command tries them again", file=sys.stderr)
+        sys.exit(1)
 
 
 @contextlib.contextmanager

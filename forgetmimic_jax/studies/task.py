@@ -36,11 +36,13 @@ class Task:
     """One run of a command of this package.
 
     Args:
-        folder: its `--output`. Every worker sees it under this absolute path.
+        folder: that it writes to. Every worker sees it under this absolute path.
         command: its name, such as `unlearn`.
         flags: of the command, all but `--output` and `--resume`.
         iterations: how long it trains.
         last: the file in `folder` that the command writes last; with it, the task is finished.
+        adds: it adds to a folder that is there already, and continues by itself. Other commands make `folder`, their
+            `--output`, and continue with `--resume`.
     """
 
     folder: Path
@@ -48,6 +50,7 @@ class Task:
     flags: tuple[str, ...]
     iterations: int
     last: str = "evaluation.json"
+    adds: bool = False
 
     @property
     def finished(self) -> bool:
@@ -181,11 +184,12 @@ def _start(task: Task, directory: Path, threads: int) -> subprocess.Popen | None
     """The task's process; None if the task was stopped before."""
     from forgetmimic_jax.training.checkpoint import newest_checkpoint
 
-    resume = newest_checkpoint(task.folder) is not None
-    if not resume:
-        shutil.rmtree(task.folder, ignore_errors=True)  # nothing in it to continue with
     command = [sys.executable, "-m", "forgetmimic_jax.studies.process", task.command, *task.flags]
-    command += ["--output", str(task.folder), *["--resume"] * resume]
+    if not task.adds:
+        resume = newest_checkpoint(task.folder) is not None
+        if not resume:
+            shutil.rmtree(task.folder, ignore_errors=True)  # nothing in it to continue with
+        command += ["--output", str(task.folder), *["--resume"] * resume]
     with _lock, task.log.open("a") as log:
         if task.folder not in _here:
             return None

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import itertools
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from forgetmimic_jax.basics.provenance import provenance
 from forgetmimic_jax.motion.library import library_hash
 from forgetmimic_jax.robot.model import roles_file
 from forgetmimic_jax.settings.config import Config, to_dict
+from forgetmimic_jax.settings.options import flags_of
 from forgetmimic_jax.studies.executor import run_tasks
 from forgetmimic_jax.studies.task import Task
 from forgetmimic_jax.tracking.setup import library_folder
@@ -92,19 +92,6 @@ def _folder(root: Path, kind: str, targets: Sequence[str], seed: int, content: A
 def without_code(name: str) -> str:
     """A trial's name but for the code that made it."""
     return name.rpartition("-")[0]
-
-
-def flags_of(options: Options) -> tuple[str, ...]:
-    """The command line of options that are not the defaults."""
-    flags: list[str] = []
-    for option in fields(options):
-        value, default = getattr(options, option.name), getattr(Options(), option.name)
-        if option.name == "set":
-            value, default = list(itertools.chain(*value)), []
-        if value != default:
-            values = value if isinstance(value, list) else [] if value is True else [value]
-            flags += [f"--{option.name}", *map(str, values)]
-    return tuple(flags)
 
 
 def run_trials(trials: Sequence[Trial], *, jobs: int, cluster: str | None, description: str) -> dict[Trial, str]:

@@ -1,20 +1,32 @@
-"""Trials on a cluster of two dask workers of this machine: one is killed, and the other finishes its trial."""
+"""Trials on a cluster of two dask workers of this machine: one is killed, and the other finishes its trial.
 
+Then what every command that takes `--cluster` gives to its workers.
+"""
+
+import dataclasses
 import json
 import os
 import re
+import shutil
 import signal
 import threading
+from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 from distributed import Client, LocalCluster
-from miniature import Run, load_state
+from miniature import TINY, Run, load_state
 from waiting import until
 
+from forgetmimic_jax import evidence, pretrain, sweep
 from forgetmimic_jax.basics.provenance import cores
+from forgetmimic_jax.evaluation.document import read_evaluation
+from forgetmimic_jax.settings.config import load_config
+from forgetmimic_jax.settings.options import parse
+from forgetmimic_jax.studies import executor, trials
 from forgetmimic_jax.studies.executor import RESOURCE
+from forgetmimic_jax.studies.task import Task
 from forgetmimic_jax.studies.trials import Trial, make_trial, run_trials
 
 LENGTH = 30  # iterations, with a checkpoint every two: long enough to be killed on the way
@@ -66,3 +78,87 @@ def test_a_trial_whose_worker_is_killed_ends_on_the_other_as_it_would_have(clust
     jax.tree.map(np.testing.assert_array_equal, *states)
     measured = [json.loads((run.folder / "evaluation.json").read_text()) for run in (disturbed, undisturbed)]
     assert measured[0]["policies"] == measured[1]["policies"]
+
+
+def test_a_base_is_trained_on_a_cluster(cluster, library_folder, tmp_path, capsys):
+    settings = [*TINY, "evaluate_every=2", "evaluate_episodes=2"]
+    given = {"library": library_folder, "base": Path("none"), "iterations": 2, "episodes": 2, "set": [settings]}
+    where = {"seeds": 1, "seed": 3, "cluster": cluster.scheduler_address, "output": tmp_path / "base"}
+    pretrain.main(pretrain.Options(**given, **where))
+    folder = tmp_path / "base-3"
+    assert load_config(folder / "config.yaml").seed == 3
+    assert set(read_evaluation(folder / "evaluation.json").policies) == {"base", "zero_action"}
+    assert re.search(rf"^base-3 +{folder}$", capsys.readouterr().out, re.MULTILINE)
+
+
+class Submitted(Exception):
+    """Ends a command where it would run its tasks."""
+
+    def __init__(self, tasks: list[Task], given: dict):
+        super().__init__()
+        self.tasks, self.where = tasks, {name: given[name] for name in ("jobs", "cluster")}
+
+
+@pytest.fixture
+def submitted(monkeypatch):
+    """Calls a command, and returns the tasks that it wants to run, and where."""
+
+    def run_tasks(tasks, **given):
+        raise Submitted(list(tasks), given)
+
+    def submitted(main, options) -> Submitted:
+        with pytest.raises(Submitted) as found:
+            main(options)
+        return found.value
+
+    monkeypatch.setattr(executor, "run_tasks", run_tasks)
+    monkeypatch.setattr(trials, "run_tasks", run_tasks)
+    return submitted
+
+
+WHERE = {"jobs": 3, "cluster": "tcp://scheduler:8786"}
+
+
+def test_every_seed_of_a_pretraining_is_a_task(submitted, library_folder, tmp_path):
+    one = pretrain.Options(library=library_folder, without="turn", set=[["ppo.epochs=2"]], iterations=400)
+    several = dataclasses.replace(one, seed=4, seeds=2, output=tmp_path / "base", **WHERE)
+    found = submitted(pretrain.main, several)
+    assert found.where == WHERE
+    assert [task.folder.name for task in found.tasks] == ["base-4", "base-5"]
+    for seed, task in zip((4, 5), found.tasks, strict=True):
+        assert parse(pretrain.Options, "pretrain", task.flags) == dataclasses.replace(one, seed=seed)
+        assert (task.command, task.iterations, task.adds) == ("pretrain", 400, False)
+
+
+def test_every_run_to_attack_is_a_task(submitted, unlearned_run, tmp_path):
+    runs = [shutil.copytree(unlearned_run.folder, tmp_path / name) for name in ("a", "b")]
+    one = evidence.Options(run=Path("a"), full=True, recovery_iterations=7)
+    found = submitted(evidence.main, dataclasses.replace(one, run=Path(",".join(map(str, runs))), **WHERE))
+    assert found.where == WHERE
+    for run, task in zip(runs, found.tasks, strict=True):
+        assert parse(evidence.Options, "evidence", task.flags) == dataclasses.replace(one, run=run)
+        assert (task.folder, task.command, task.last, task.adds) == (run, "evidence", "evidence.json", True)
+
+
+def test_every_trial_of_a_sweep_is_a_task(submitted, base_run, tmp_path):
+    given = {"bases": str(base_run.checkpoint(4)), "targets": "turn", "trials": tmp_path, "output": tmp_path}
+    found = submitted(sweep.main, sweep.Options(kind="seeds", seeds=2, iterations=2, episodes=2, **given, **WHERE))
+    assert found.where == WHERE
+    assert len(found.tasks) == 2
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"seeds": 0}, "--seeds: found 0; accepted: 1 or more"),
+        ({"seeds": 2, "jobs": 0}, "--jobs: found 0; accepted: 1 or more"),
+        ({"jobs": 2}, "--jobs: found 2; accepted: only with --seeds"),
+        ({"cluster": "tcp://a:1"}, "--cluster: found tcp://a:1; accepted: only with --seeds"),
+        (
+            {"seeds": 2, "resume": True},
+            "--resume: found with --seeds; leave it out: the same command continues what was stopped",
+        ),
+    ],
+)
+def test_flags_of_several_trainings_that_do_not_fit_are_refused(refused, given, message):
+    assert refused(pretrain.main, pretrain.Options(output=Path("run"), **given)) == message

@@ -1,5 +1,6 @@
 """Tasks on this machine. The process here is a few lines that write what a run writes, so that only the care counts."""
 
+import contextlib
 import os
 import re
 import signal
@@ -17,13 +18,13 @@ from waiting import until
 from forgetmimic_jax.basics.errors import InputError, Interrupted
 from forgetmimic_jax.basics.provenance import cores, provenance
 from forgetmimic_jax.studies import executor, task
-from forgetmimic_jax.studies.executor import RESOURCE, on_cluster, run_tasks
+from forgetmimic_jax.studies.executor import RESOURCE, on_cluster, run_tasks, run_together
 from forgetmimic_jax.studies.task import ATTEMPTS, Task, run_task
 
 RUN = """#!{python}
 import os, pathlib, signal, sys, time
 flag = dict(zip(sys.argv[1:], sys.argv[2:]))
-folder = pathlib.Path(flag["--output"])
+folder = pathlib.Path(flag.get("--output") or flag["--run"])
 journal = folder.parent / "journal"
 def note(what):
     with journal.open("a") as file:
@@ -44,7 +45,7 @@ if flag["--seed"] == "6" or flag["--seed"] == "7" and "--resume" not in sys.argv
 if flag["--seed"] == "5":
     (folder / "threads").write_text(" ".join(os.environ[name] for name in ("PYTHON_CPU_COUNT", "NPROC")))
 time.sleep(60 if flag["--seed"] == "9" else 0.2)
-(folder / "evaluation.json").write_text("{{}}")
+(folder / flag.get("--last", "evaluation.json")).write_text("{{}}")
 note("end")
 """
 
@@ -92,6 +93,31 @@ def test_what_is_finished_is_not_run_again_and_what_failed_is(tmp_path):
     for _ in range(2):
         run_tasks(wanted, jobs=1, description="try")
     assert journal(tmp_path) == ["start 0", "end 0", "start 1", "start 1"]
+
+
+def test_a_command_that_adds_to_a_run_finds_the_run_as_it_was(tmp_path):
+    run, flags = tmp_path / "trials" / "run", ("--seed", "2", "--last", "evidence.json")
+    (run / "checkpoints" / "00000008").mkdir(parents=True)
+    (run / "checkpoints" / "00000008" / "meta.json").write_text("{}")
+    (run / "evaluation.json").write_text("of the run")
+    wanted = Task(run, "evidence", (*flags, "--run", str(run)), iterations=0, last="evidence.json", adds=True)
+    assert run_tasks([wanted], jobs=1, description="try") == {}
+    assert (run / "checkpoints" / "00000008").is_dir()
+    assert (run / "evaluation.json").read_text() == "of the run"
+    assert journal(tmp_path) == ["start 2", "end 2"]  # and no --resume
+
+
+@pytest.mark.parametrize(("seeds", "code"), [((0, 2), None), ((0, 1), 1)])
+def test_a_command_of_many_tasks_says_where_they_are_and_fails_if_one_does(tmp_path, seeds, code, capsys):
+    wanted = [a_task(tmp_path, seed) for seed in seeds]
+    with contextlib.suppress(SystemExit) if code is None else pytest.raises(SystemExit) as end:
+        run_together(wanted, "make it so", jobs=1, description="try")
+    printed = capsys.readouterr()
+    assert str(wanted[0].folder) in printed.out
+    assert "Next: make it so" in printed.out
+    if code:
+        assert end.value.code == code
+        assert printed.err == "1 of 2 failed; the same command tries them again\n"
 
 
 @pytest.mark.parametrize("jobs", [1, 3])
