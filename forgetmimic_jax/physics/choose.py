@@ -23,6 +23,9 @@ def make_engine(robot: Robot, config: PhysicsConfig, num_envs: int, shards: int 
         from forgetmimic_jax.physics.native import NativeEngine
 
         return NativeEngine(robot, config.substeps, num_envs, shards=shards)
-    from forgetmimic_jax.physics.mjx import MjxEngine
+    from forgetmimic_jax.physics.mjx import MjxEngine, Room
 
-    return MjxEngine(robot, config.substeps, implementation="warp" if name == "mjx-warp" else "jax")
+    if name == "mjx":
+        return MjxEngine(robot, config.substeps)
+    room = Room(config.warp_contacts, config.warp_constraints)
+    return MjxEngine(robot, config.substeps, implementation="warp", room=room)

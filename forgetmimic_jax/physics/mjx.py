@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,7 @@ import mujoco
 import numpy as np
 from jax import Array
 
+from forgetmimic_jax.basics.console import warn
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.physics.engine import (
     BodyState,
@@ -28,20 +30,31 @@ with contextlib.redirect_stdout(io.StringIO()):  # without warp, the import prin
     from mujoco import mjx
     from mujoco.mjx._src import support
 
-# Room per environment in Warp's arrays (paper, appendix 'Simulation'); the jax implementation sizes its own.
-WARP_CONTACTS = 35
-WARP_CONSTRAINTS = 250
+# What no longer fits into Warp's arrays, and the setting that gives more room: bits of mujoco_warp's OverflowType.
+FULL = {"warp_constraints": 1 << 0, "warp_contacts": (1 << 2) | (1 << 3)}
+
+
+class Room(NamedTuple):
+    """Of an environment in Warp's arrays; the jax implementation sizes its own."""
+
+    contacts: int
+    constraints: int
+
+
+PAPER_ROOM = Room(contacts=35, constraints=250)  # paper, appendix 'Simulation'
 
 
 class MjxEngine:
     """MJX under `vmap`; the model's randomised values enter as mapped leaves of the model."""
 
-    def __init__(self, robot: Robot, substeps: int, implementation: Literal["jax", "warp"] = "jax"):
+    def __init__(
+        self, robot: Robot, substeps: int, implementation: Literal["jax", "warp"] = "jax", room: Room = PAPER_ROOM
+    ):
         if implementation == "warp" and not mujoco.mjx.warp.WARP_INSTALLED:
             raise InputError("physics engine 'mjx-warp': warp is not installed; pip install 'mujoco-mjx[warp]'")
         self._robot = robot
         self._substeps = substeps
-        self._implementation = implementation
+        self._implementation, self._room = implementation, room
         self._keys = robot.key_body_ids
         self._anchor = robot.anchor_body_id
         self._feet = robot.foot_geom_ids
@@ -50,7 +63,7 @@ class MjxEngine:
         # Bodies at the new state are always computed in jax: Warp gives velocities only inside a whole step.
         self._body_model = mjx.put_model(plain, impl="jax")
         self._body_data = mjx.make_data(plain, impl="jax")
-        self._model = self._body_model if implementation == "jax" else mjx.put_model(robot.model, impl="warp")
+        self._model = self._body_model if implementation == "jax" else _warp_model(robot)
 
     @property
     def num_contacts(self) -> int:
@@ -66,7 +79,7 @@ class MjxEngine:
 
         def one(
             state: PhysicsState, parameters: PhysicsParameters, joint_target: Array, wrench: Array
-        ) -> tuple[PhysicsState, Array]:
+        ) -> tuple[PhysicsState, Array, Array]:
             model = self._model.tree_replace(
                 {
                     "geom_friction": self._model.geom_friction.at[self._feet, 0].set(parameters.foot_friction),
@@ -80,12 +93,16 @@ class MjxEngine:
                 ctrl=joint_target,
                 xfrc_applied=start.xfrc_applied.at[self._anchor].set(wrench),
             )
-            data, _ = jax.lax.scan(lambda d, _: (physics_step(model, d), None), data, length=self._substeps)
-            return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart), self._contact_force(model, data)
+            data, full = jax.lax.scan(
+                lambda d, _: ((d := physics_step(model, d)), self._full(d)), data, length=self._substeps
+            )
+            return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart), self._contact_force(model, data), full
 
         # An accelerator's default precision for products (TF32, bfloat16) would ruin the solver.
         with jax.default_matmul_precision("highest"):
-            state, force = jax.vmap(one)(state, parameters, joint_target, wrench)
+            state, force, full = jax.vmap(one)(state, parameters, joint_target, wrench)
+            if self._implementation == "warp":
+                _say_where_full(full, self._room)
             return state, self._bodies(state, force)
 
     def forward(self, state: PhysicsState, parameters: PhysicsParameters, mask: Array, bodies: BodyState) -> BodyState:
@@ -98,7 +115,11 @@ class MjxEngine:
         """The data of one environment at rest, with Warp's contact arrays large enough for all of them."""
         if self._implementation == "jax":
             return self._body_data
-        return _warp_data(self._robot, num_envs)
+        return _warp_data(self._robot, num_envs, self._room)
+
+    def _full(self, data: mjx.Data) -> Array:
+        """Which of FULL a physics step ran out of, as bits []."""
+        return data._impl.overflow if self._implementation == "warp" else jnp.zeros((), jnp.int32)
 
     def _bodies(self, state: PhysicsState, force: Array) -> BodyState:
         """Key bodies at `state`, with the contact forces [env, key_body, 3] given."""
@@ -157,10 +178,39 @@ def _without_contact_sensors(spec: mujoco.MjSpec) -> mujoco.MjModel:
     return spec.compile()
 
 
-def _warp_data(robot: Robot, num_envs: int) -> mjx.Data:
+def _warp_model(robot: Robot) -> mjx.Model:
+    """Warp's model, which leaves it to `_say_where_full` to say that its arrays are full."""
+    import warp
+
+    warp.config.quiet = True  # type: ignore[attr-defined]
+    model = mjx.put_model(robot.model, impl="warp")
+    return model.replace(opt=model.opt.replace(_impl=model.opt._impl.replace(warn_overflow=0)))
+
+
+def _say_where_full(full: Array, room: Room) -> None:
+    """Warn, once for each setting of FULL, if any of the bits `full` is set: a contact was left out of a step."""
+
+    def say(bits: np.ndarray) -> None:
+        for setting, mask in FULL.items():
+            if (bits & mask).any():
+                _say_full(setting, getattr(room, setting.removeprefix("warp_")))
+
+    masks = sum(FULL.values())
+    jax.lax.cond(((full & masks) != 0).any(), lambda: jax.debug.callback(say, full), lambda: None)
+
+
+@functools.cache
+def _say_full(setting: str, room: int) -> None:
+    warn(
+        f"physics.{setting}: {room} is too few, so contacts were left out of the simulation and the robot moved "
+        f"wrongly; give more with --set physics.{setting}={2 * room}"
+    )
+
+
+def _warp_data(robot: Robot, num_envs: int, room: Room) -> mjx.Data:
     """Warp's data for one of `num_envs` environments."""
     with jax.ensure_compile_time_eval():
-        data = mjx.make_data(robot.model, impl="warp", naconmax=WARP_CONTACTS * num_envs, njmax=WARP_CONSTRAINTS)
+        data = mjx.make_data(robot.model, impl="warp", naconmax=room.contacts * num_envs, njmax=room.constraints)
     return jax.tree.map(_broadcast_constant, data)
 
 

@@ -48,6 +48,8 @@ class PhysicsConfig:
     solver_iterations: Count = 10
     line_search_iterations: Count = 20
     self_collision: bool = False
+    warp_contacts: Count = 35  # room of mjx-warp, an environment: contact points, on average over all environments
+    warp_constraints: Count = 250  # and rows of contact forces and joint limits
 
     @property
     def control_step(self) -> float:

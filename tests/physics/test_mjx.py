@@ -15,7 +15,7 @@ import pytest
 from physics_cases import CASES, FLIGHT, SUBSTEPS
 
 from forgetmimic_jax.basics.errors import InputError
-from forgetmimic_jax.physics.mjx import WARP_CONSTRAINTS, WARP_CONTACTS, MjxEngine
+from forgetmimic_jax.physics.mjx import PAPER_ROOM, MjxEngine, _say_full
 from forgetmimic_jax.robot.model import load_robot
 from forgetmimic_jax.settings.config import PhysicsConfig
 from forgetmimic_jax.tracking.layouts import LAYOUTS, Moment
@@ -171,8 +171,9 @@ def test_only_pairs_of_floor_and_robot_make_contacts(robot, engine):
 
 def test_warp_has_room_for_every_contact_and_joint_limit(robot, engine):
     rows_of_a_contact = 4  # a pyramid of two tangents
-    assert engine.num_contacts <= WARP_CONTACTS
-    assert rows_of_a_contact * engine.num_contacts + robot.num_joints <= WARP_CONSTRAINTS
+    assert engine.num_contacts <= PAPER_ROOM.contacts
+    assert rows_of_a_contact * engine.num_contacts + robot.num_joints <= PAPER_ROOM.constraints
+    assert (PhysicsConfig().warp_contacts, PhysicsConfig().warp_constraints) == PAPER_ROOM
 
 
 def test_warp_that_is_not_installed_is_told_in_one_line(robot, monkeypatch):
@@ -182,12 +183,36 @@ def test_warp_that_is_not_installed_is_told_in_one_line(robot, monkeypatch):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.skipif(not (mujoco.mjx.warp.WARP_INSTALLED and has_gpu()), reason="needs warp and a CUDA GPU")
-def test_warp_step_equals_the_native_engines(robot, inputs, native_result):
-    result = jax.jit(MjxEngine(robot, SUBSTEPS, implementation="warp").step)(*inputs)
-    for part, expected in zip(result, native_result, strict=True):
+needs_warp = pytest.mark.skipif(not mujoco.mjx.warp.WARP_INSTALLED, reason="needs warp-lang: no wheel for this machine")
+
+
+@pytest.fixture(scope="module")
+def warp_result(robot, inputs):
+    return jax.block_until_ready(jax.jit(MjxEngine(robot, SUBSTEPS, implementation="warp").step)(*inputs))
+
+
+@needs_warp
+def test_warp_step_equals_the_native_engines(warp_result, native_result, capfd):
+    for part, expected in zip(warp_result, native_result, strict=True):
         for name, values in vars(part).items():
             assert_close(name, values, getattr(expected, name))
+    assert capfd.readouterr() == ("", "")
+
+
+@needs_warp
+def test_warp_says_once_which_room_is_too_small(robot, inputs, native_result, capfd):
+    engine = MjxEngine(robot, SUBSTEPS, implementation="warp", room=PAPER_ROOM._replace(constraints=20))
+    _say_full.cache_clear()
+    step = jax.jit(engine.step)
+    for _ in range(2):
+        state, _ = jax.block_until_ready(step(*inputs))
+    assert np.abs(state.qvel - native_result[0].qvel).max() > 1.0
+    jax.effects_barrier()
+    said = " ".join(capfd.readouterr().err.split())
+    assert said == (
+        "warning: physics.warp_constraints: 20 is too few, so contacts were left out of the simulation and the robot "
+        "moved wrongly; give more with --set physics.warp_constraints=40"
+    )
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
