@@ -87,7 +87,7 @@ tables: .venv/.installed ## rewrite the README's tables and the studies' pages f
 	done
 	.venv/bin/python -m experiments.claims
 
-test: .venv/.installed ## run the tests
+test: .venv/.installed .venv/.warp ## run the tests
 	.venv/bin/python -m pytest --numprocesses=logical --maxprocesses=4 --dist=loadfile --no-loadscope-reorder $(ARGS)
 
 mutants: .venv/.installed ## see which faults of one line the tests notice (half an hour; ARGS=--list names them)
@@ -95,6 +95,11 @@ mutants: .venv/.installed ## see which faults of one line the tests notice (half
 
 soak: .venv/.installed ## kill, fill, mutate and train random policies: hours of faults on purpose (ARGS=--help lists the parts)
 	.venv/bin/python tests/soak.py $(ARGS)
+
+# Warp takes 400 MB. Without a GPU only the tests of mjx-warp use it; where it has no wheel they are left out.
+.venv/.warp: requirements-warp.lock .venv/.installed
+	@.venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps -r $< || echo 'no Warp here'
+	@touch $@
 
 lint: .venv/.installed ## check style, formatting and types
 	.venv/bin/ruff check .

@@ -111,6 +111,14 @@ def test_the_growth_over_devices_is_measured_and_past_the_cores_computed(monkeyp
     assert "computed" in printed
 
 
+def test_one_device_has_nothing_to_average(tiny, tmp_path, library_folder):
+    output = tmp_path / "figures.json"
+    finished(bench.main, bench.Options(library=library_folder, repeats=2, devices="1", output=output))
+    row = json.loads(output.read_text())
+    assert (row["devices"], row["environments"], row["control_steps"]) == (1, 8, 8 * 4)
+    assert row["iteration_seconds"] > 100 * row["averaging_seconds"]
+
+
 def test_the_first_number_of_devices_must_be_measured(monkeypatch, refused):
     def figures_of(*_):
         raise InputError("its bench ended: error: --devices: found 2; accepted: 1")

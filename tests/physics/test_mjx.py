@@ -216,7 +216,8 @@ def test_warp_says_once_which_room_is_too_small(robot, inputs, native_result, ca
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_a_policy_of_any_layout_sees_the_same_with_both_engines(robot, result, native_result, name):
+@pytest.mark.parametrize("outcome", ["result", pytest.param("warp_result", marks=needs_warp)])
+def test_a_policy_of_any_layout_sees_the_same_with_every_engine(robot, request, native_result, outcome, name):
     """Each robot after its step, whose reference is a robot that stands at rest."""
     still = jax.tree.map(lambda values: jnp.broadcast_to(values, (len(CASES), *values.shape)), stand_frame(robot))
     nothing = jnp.zeros((len(CASES), robot.num_joints))
@@ -225,6 +226,6 @@ def test_a_policy_of_any_layout_sees_the_same_with_both_engines(robot, result, n
         moment = Moment(robot.arrays, still, physics, bodies, nothing, robot.anchor, robot.root)
         return actor_observation(LAYOUTS[name], robot.policy_joints, moment)
 
-    found, expected = (np.asarray(seen(*outcome)) for outcome in (result, native_result))
+    found, expected = (np.asarray(seen(*step)) for step in (request.getfixturevalue(outcome), native_result))
     assert found.shape == (len(CASES), LAYOUTS[name].size(robot.num_joints))
     np.testing.assert_allclose(found, expected, rtol=0, atol=TOLERANCE["ang_vel"])
