@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from forgetmimic_jax.basics.errors import InputError, run_command
+from forgetmimic_jax.basics.files import write_atomically
 from forgetmimic_jax.basics.provenance import cores, made_here
 from forgetmimic_jax.settings.config import EngineName, Preset
 from forgetmimic_jax.settings.options import at_least, comma_separated, on_engine, parse, replace_given
@@ -86,7 +87,8 @@ def main(options: Options) -> None:
         show(figures, f"{options.robot}, preset {options.preset}, {figures['engine']} engine")
     if options.output:
         options.output.parent.mkdir(parents=True, exist_ok=True)
-        options.output.write_text(json.dumps(figures | {"made": dataclasses.asdict(made_here())}, indent=2) + "\n")
+        figures["made"] = dataclasses.asdict(made_here())
+        write_atomically(options.output, (json.dumps(figures, indent=2) + "\n").encode())
         print(f"figures  {options.output}")
 
 

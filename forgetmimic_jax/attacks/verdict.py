@@ -19,14 +19,13 @@ from forgetmimic_jax.attacks.document import CONTROL, Compared, EvidenceDocument
 from forgetmimic_jax.evaluation.document import Estimate
 from forgetmimic_jax.evaluation.metrics import UNLEARNED
 from forgetmimic_jax.evaluation.relearning import Lasted, lasted
-from forgetmimic_jax.evaluation.tables import FORGOTTEN, KEPT, number, percent
+from forgetmimic_jax.evaluation.tables import FORGOTTEN, KEPT, KEPT_CLIP, number, percent
 from forgetmimic_jax.evaluation.verdict import (
     ALIKE,
     CONSISTENT,
     FAILED,
     FASTER,
     INCONCLUSIVE,
-    KEPT_CLIP,
     RECOVERABLE,
     Skill,
     Verdict,

@@ -20,15 +20,18 @@ from rich.table import Table
 from rich.text import Text
 
 from forgetmimic_jax.basics.errors import InputError, run_command
+from forgetmimic_jax.basics.files import write_atomically
 from forgetmimic_jax.evaluation import statistics
 from forgetmimic_jax.evaluation.document import Estimate, EvaluationDocument, GroupResult, read_evaluation
 from forgetmimic_jax.evaluation.metrics import BASE, FINE_TUNED, HOLD_SECONDS, UNLEARNED, ZERO_ACTION
 
 POLICY_ORDER = (BASE, UNLEARNED, "retrained", FINE_TUNED, ZERO_ACTION)
 
-FORGOTTEN, KEPT = 0.2, 0.8  # a clip is forgotten at most, kept at least, at this share of the base's skill
-WANTED = {"target": "forgotten", "kept": "kept"}
-UNWANTED = {"target": "still known", "kept": "lost"}
+# Shares of the base's skill: a target is forgotten at FORGOTTEN or less, a kept clip is kept at KEPT or more. One clip
+# varies more from training to training than the mean of all: on the G1 three distilled policies retain 93 % of the kept
+# clips' skill on average, and 68, 77 and 81 % on their weakest clip. Below KEPT_CLIP a clip counts as lost.
+FORGOTTEN, KEPT, KEPT_CLIP = 0.2, 0.8, 0.5
+COLOURS = {"forgotten": "green", "kept": "green", "still known": "red", "lost": "red"}
 
 UNITS = {
     "episode_length": "steps",
@@ -190,9 +193,9 @@ def _clip_rows(document: EvaluationDocument, *, digits: int = 3, interval: bool 
 def _result(retained: Estimate | None, role: str) -> str:
     if retained is None or retained.mean is None:
         return "not learned"
-    if FORGOTTEN < retained.mean < KEPT:
-        return "weakened"
-    return (WANTED if (retained.mean <= FORGOTTEN) == (role == "target") else UNWANTED)[role]
+    if role == "target":
+        return "forgotten" if retained.mean <= FORGOTTEN else "still known"
+    return "kept" if retained.mean >= KEPT else "weakened" if retained.mean >= KEPT_CLIP else "lost"
 
 
 def _group_rows(document: EvaluationDocument, *, digits: int = 3) -> Rows:
@@ -352,12 +355,11 @@ def _line(cells: Sequence[str]) -> str:
 
 
 def _rich(table: Rows) -> Table:
-    colours = {text: "green" for text in WANTED.values()} | {text: "red" for text in UNWANTED.values()}
     view = Table(title=table.title, title_justify="left", box=box.SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
     for column, name in enumerate(table.header):
         view.add_column(name, no_wrap=column == 0)
     for row in table.rows:
-        view.add_row(*row[:-1], Text(row[-1], style=colours.get(row[-1], "")))
+        view.add_row(*row[:-1], Text(row[-1], style=COLOURS.get(row[-1], "")))
     return view
 
 
@@ -365,7 +367,7 @@ def main() -> None:
     """Fill the evaluation blocks of the Markdown files named on the command line."""
     for name in sys.argv[1:]:
         path = Path(name)
-        path.write_text(fill(path.read_text(), path.parent))
+        write_atomically(path, fill(path.read_text(), path.parent).encode())
 
 
 if __name__ == "__main__":

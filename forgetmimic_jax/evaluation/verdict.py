@@ -17,14 +17,11 @@ from typing import NamedTuple
 from forgetmimic_jax.evaluation.document import Estimate, PolicyResult
 from forgetmimic_jax.evaluation.metrics import UNLEARNED
 from forgetmimic_jax.evaluation.relearning import Lasted
-from forgetmimic_jax.evaluation.tables import FORGOTTEN, KEPT, percent
+from forgetmimic_jax.evaluation.tables import FORGOTTEN, KEPT, KEPT_CLIP, percent
 
 CONSISTENT, RECOVERABLE = "consistent with retraining", "suppressed but recoverable"
 INCONCLUSIVE, FAILED = "inconclusive", "failed"
 
-# One clip varies more from training to training than the mean of all: on the G1 three distilled policies retain 93 % of
-# the kept clips' skill on average, and 68, 77 and 81 % on their weakest clip. Below a half a clip counts as lost.
-KEPT_CLIP = 0.5
 # Closer than this share of (base − zero action) on a target, two policies do the same there: as for `FORGOTTEN`, so
 # little skill counts as none. On the G1 distilled policies of three seeds differ by up to 0.09 on a target, and their
 # intervals come on top, so that a smaller share would separate retrained policies from each other. It is a share, since
