@@ -16,7 +16,7 @@ from forgetmimic_jax.studies.lab import Lab
 from forgetmimic_jax.studies.policies import retrained_in_words
 from forgetmimic_jax.studies.study import Document, Study
 from forgetmimic_jax.studies.variants import TRACKING, paired, variant_bars, variant_table
-from forgetmimic_jax.unlearning import distill
+from forgetmimic_jax.unlearning import distill, stand
 from forgetmimic_jax.unlearning.method import SHORT
 
 ARFT, PLAIN_ARFT = "arft", "arft, plain PPO"
@@ -69,7 +69,7 @@ def body(document: Document) -> str:
             "weights; of the cpu preset they have the starts, and *plain PPO* has not. *stand* has a loss of its own "
             "with the clips' weights.\n"
         )
-        steps = {"distill": distill.PACE.ppo["cpu"], "the others": SHORT}
+        steps = {"distill": distill.PACE.ppo["cpu"], "stand": stand.PACE.ppo["cpu"], "the others": SHORT}
         counts = ", ".join(f"{name} {of['minibatches'] * of['epochs']}" for name, of in steps.items())
         parts.append(f"Gradient steps an iteration: {counts}.\n")
     if CONTROL in variants:

@@ -1,6 +1,11 @@
 """The structure of the package: which folder may import from which, and what stands at the top."""
 
 import ast
+import itertools
+import re
+import sys
+import tomllib
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
@@ -75,3 +80,19 @@ def test_every_folder_says_what_is_in_it_and_what_is_not():
     for name in folders:
         text = ast.get_docstring(ast.parse((PACKAGE / name / "__init__.py").read_text())) or ""
         assert text.count(".") >= 2, f"{name}/__init__.py: two sentences, what is there and what is not"
+
+
+def test_every_package_that_is_imported_is_a_dependency():
+    """An environment that has more than the dependencies would hide one that is missing."""
+    project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text())["project"]
+    extras = itertools.chain(*(project["optional-dependencies"][name] for name in ("cluster", "warp")))
+    declared = {re.split(r"[^\w.-]", name)[0].lower().replace("_", "-") for name in (*project["dependencies"], *extras)}
+    declared.add("warp-lang")  # of mujoco-mjx[warp]
+    homes = packages_distributions()
+    for path in MODULES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module] if isinstance(node, ast.ImportFrom) and node.module and not node.level else []
+            for top in {name.partition(".")[0] for name in names} - sys.stdlib_module_names - {PACKAGE.name}:
+                packages = {home.lower().replace("_", "-") for home in homes.get(top, [top])}
+                assert packages & declared, f"{path}: {top} is in none of the dependencies"
