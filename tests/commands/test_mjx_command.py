@@ -3,9 +3,12 @@ import os
 import subprocess
 import sys
 
+from forgetmimic_jax.basics.provenance import cores
+
 LIMIT = 900  # s, far above what compilation takes here: only a run that waits forever needs longer
+DEVICES = min(2, cores())  # of the training; the evaluation is on one
 # LAPACK shares a batch out among XLA's threads from 15 matrices of the G1's size on.
-ENVIRONMENTS, EPISODES = 16, 6
+ENVIRONMENTS, EPISODES = 16 * DEVICES, 6
 
 
 def test_a_whole_run_with_mjx_on_a_cpu_ends(base_run, tmp_path):
@@ -14,7 +17,18 @@ def test_a_whole_run_with_mjx_on_a_cpu_ends(base_run, tmp_path):
     settings = [f"ppo.num_envs={ENVIRONMENTS}", "ppo.num_steps=4", "ppo.minibatches=2"]
     command = [
         *(sys.executable, "-m", "forgetmimic_jax.unlearn", "--physics", "mjx", "--iterations", "2"),
-        *("--base", base_run.checkpoint(4), "--targets", "turn", "--episodes", EPISODES, "--output", output),
+        *(
+            "--devices",
+            DEVICES,
+            "--base",
+            base_run.checkpoint(4),
+            "--targets",
+            "turn",
+            "--episodes",
+            EPISODES,
+            "--output",
+            output,
+        ),
         *("--set", *settings),
     ]
     done = subprocess.run(
