@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from forgetmimic_jax.robot.check import FLOOR
-from forgetmimic_jax.robot.shapes import FRICTION, KINDS, Sphere, set_shapes
+from forgetmimic_jax.robot.shapes import FRICTION, KINDS, Sphere, give_way, set_shapes
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ def read_mjcf(file: Path, additions: Additions | None = None) -> tuple[mujoco.Mj
     _keep_inertias(spec, model)
     _keep_one_robot(spec, model, notes)
     _leave_out_what_drives(spec, notes)
-    _set_ground(spec, notes)
+    _set_ground(spec, model, notes)
     _set_joints(spec, additions, notes)
     set_shapes(spec, additions.spheres, notes)
     return spec, notes
@@ -144,8 +144,13 @@ def _keep_one_robot(spec: mujoco.MjSpec, model: mujoco.MjModel, notes: list[str]
             spec.delete(joint)
         notes.append(f"{len(own)} joints of {root.name} are replaced by a free joint")
     elif own and own[0].type != mujoco.mjtJoint.mjJNT_FREE:
-        raise Unreadable(f"{root.name} hangs on the world by a hinge; mend: put it into a body without a joint")
+        raise Unreadable(f"{root.name} hangs on the world by a hinge; mend: put <freejoint/> in its place")
     if not any(joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in root.joints):
+        if _rigid_mass(root, model) <= 0.0:
+            raise Unreadable(
+                f"{root.name} floats and has no mass; mend: give it one (<inertial>), or take away the joints of the "
+                "body that it carries"
+            )
         root.add_freejoint()
         notes.append(f"a free joint is added to {root.name}")
     if root.pos[2] <= 0.0:
@@ -155,6 +160,12 @@ def _keep_one_robot(spec: mujoco.MjSpec, model: mujoco.MjModel, notes: list[str]
 def _joints_below(body: mujoco.MjsBody) -> list[mujoco.MjsJoint]:
     own = [joint for joint in body.joints if joint.type != mujoco.mjtJoint.mjJNT_FREE]
     return own + [joint for child in body.bodies for joint in _joints_below(child)]
+
+
+def _rigid_mass(body: mujoco.MjsBody, model: mujoco.MjModel) -> float:
+    """kg of a body and of what it carries without a joint."""
+    welded = sum(_rigid_mass(child, model) for child in body.bodies if not child.joints)
+    return float(model.body(body.name).mass[0]) + welded
 
 
 def _names_below(body: mujoco.MjsBody) -> list[str]:
@@ -194,15 +205,16 @@ def _leave_out_what_drives(spec: mujoco.MjSpec, notes: list[str]) -> None:
             notes.append(f"{len(elements)} {what} are {put}")
 
 
-def _set_ground(spec: mujoco.MjSpec, notes: list[str]) -> None:
-    """One plane called `floor`, and light."""
+def _set_ground(spec: mujoco.MjSpec, model: mujoco.MjModel, notes: list[str]) -> None:
+    """One plane called `floor`, level and at height 0, and light."""
     own = list(spec.worldbody.geoms)
-    if any(geom.name == FLOOR and geom.type == KINDS.mjGEOM_PLANE and geom.pos[2] == 0.0 for geom in own):
+    if any(geom.name == FLOOR for geom in own) and _is_ground(model, model.geom(FLOOR).id):
         spec.geom(FLOOR).contype = 1
         return
     planes = [geom for geom in own if geom.type == KINDS.mjGEOM_PLANE]
     for geom in own:
         spec.delete(geom)
+    give_way(spec, FLOOR, notes)
     spec.worldbody.add_geom(
         name=FLOOR,
         type=KINDS.mjGEOM_PLANE,
@@ -215,6 +227,14 @@ def _set_ground(spec: mujoco.MjSpec, notes: list[str]) -> None:
     if not list(spec.lights):
         spec.worldbody.add_light(pos=[0.0, 0.0, 3.0], dir=[0.0, 0.0, -1.0])
     notes.append(f"the ground is {'replaced by' if planes else 'added as'} the plane '{FLOOR}'; light is there")
+
+
+def _is_ground(model: mujoco.MjModel, geom: int) -> bool:
+    """Whether a shape of the world is a plane, level and at height 0."""
+    normal = np.zeros(3)
+    mujoco.mju_rotVecQuat(normal, np.array([0.0, 0.0, 1.0]), model.geom_quat[geom])
+    level = normal[2] > 1.0 - 1e-9 and model.geom_pos[geom, 2] == 0.0
+    return bool(level and model.geom_type[geom] == KINDS.mjGEOM_PLANE)
 
 
 def _set_joints(spec: mujoco.MjSpec, additions: Additions, notes: list[str]) -> None:

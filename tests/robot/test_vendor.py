@@ -322,7 +322,12 @@ def test_everything_that_is_missing_is_said_at_once_and_can_be_given_in_the_yaml
         ("<mujoco><worldbody><body><geom size='1'/></body></worldbody></mujoco>", "no joint; a robot is a tree"),
         (
             "<mujoco><worldbody><body name='arm'><joint/><geom size='1'/></body></worldbody></mujoco>",
-            "arm hangs on the world by a hinge; mend",
+            "arm hangs on the world by a hinge; mend: put <freejoint/> in its place",
+        ),
+        (
+            "<mujoco><worldbody><body name='base'><body name='arm'><joint/><geom size='1'/></body></body></worldbody>"
+            "</mujoco>",
+            "base floats and has no mass; mend: give it one (<inertial>)",
         ),
         ("<mujoco><worldbody><body>", "no MJCF that MuJoCo reads"),
         ("no xml", "no MJCF that MuJoCo reads"),
@@ -341,6 +346,24 @@ def test_a_root_of_slides_and_hinges_is_a_free_joint(written):
     assert model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE
     assert model.nq == 7 + 17
     assert "3 joints of base are replaced by a free joint" in notes
+
+
+@pytest.mark.parametrize("name", ["floor", "left_thigh_shape0", "left_foot_sphere0"])
+def test_a_shape_whose_name_the_project_needs_is_called_otherwise(written, made, name):
+    box = '<geom type="box" size="0.1 0.1 0.05"/>'
+    model = made(written((box, box.replace("<geom", f'<geom name="{name}"'))))[0].model
+    assert model.body(model.geom(f"{name}_0").bodyid[0]).name == "base"
+    assert model.body(model.geom(name).bodyid[0]).name != "base"
+
+
+@pytest.mark.parametrize("place", ['pos="0 0 -0.2"', 'euler="0.3 0 0"', 'type="box"'])
+def test_a_floor_of_the_vendor_s_is_replaced_where_it_is_not_level_ground(written, place):
+    plane = '<geom name="ground" type="plane" size="5 5 0.1" pos="0 0 -0.2"/>'
+    kind = "" if "type" in place else 'type="plane"'
+    spec, notes = read_mjcf(written((plane, f'<geom name="floor" {kind} {place} size="5 5 0.1"/>')))
+    floor = spec.compile().geom("floor")
+    assert (floor.type, floor.pos[2], floor.quat[0]) == (mujoco.mjtGeom.mjGEOM_PLANE, 0.0, 1.0)
+    assert any(note.startswith("the ground is ") for note in notes)
 
 
 def test_our_own_robots_need_no_mend():
@@ -440,7 +463,9 @@ def test_check_ends_with_2_where_something_is_missing(run, written, tmp_path):
     assert code == 2
     assert "missing: torque limits of the joints waist" in out
     assert "1 thing(s) are missing" in err
-    assert "motors: unknown: effort" in run("add", "runs/robots/vendor/vendor.yaml")[2]
+    assert out.endswith("Next: make robot ARGS='check runs/robots/vendor/vendor.yaml'\n")
+    for command in ("check", "add"):
+        assert "motors: unknown: effort" in run(command, "runs/robots/vendor/vendor.yaml")[2]
     for arguments, message in (
         (("check", "none.xml"), "not found"),
         (("check", tmp_path / "vendor.xml", "--name", "a b"), "small letters"),
@@ -448,6 +473,28 @@ def test_check_ends_with_2_where_something_is_missing(run, written, tmp_path):
     ):
         code, out, err = run(*arguments)
         assert (code, out, message in err) == (2, "", True)
+
+
+def test_a_yaml_that_was_completed_is_checked(run, written, tmp_path):
+    run("check", written(('joint="waist" ctrlrange="-60 60"', 'joint="waist"')))
+    file = Path("runs/robots/vendor/vendor.yaml")
+    file.write_text(file.read_text().replace("armature: null, effort: null", "armature: 0.01, effort: 60.0"))
+    code, out, err = run("check", file)
+    assert (code, err) == (0, "")
+    assert "holds its default pose for 1 s" in out
+    assert out.endswith(f"Next: make robot ARGS='add {file}'\n")
+
+
+def test_limbs_that_are_not_alike_are_found_by_check(run, written, tmp_path):
+    wrist = '<joint name="right_wrist" axis="0 0 1" range="-1 1"/>'
+    motor = '<motor name="right_wrist" joint="right_wrist" ctrlrange="-20 20"/>'
+    code, out, err = run("check", written((wrist, ""), (motor, "")))
+    assert code == 2
+    line = "pairs: hands: the left limb has 4 joints and the right one 3; accepted: as many"
+    assert f"missing: {line}" in out.splitlines()
+    assert f"# - {line}" in (tmp_path / "runs/robots/vendor/vendor.yaml").read_text().splitlines()
+    assert out.endswith("Next: make robot ARGS='check runs/robots/vendor/vendor.yaml'\n")
+    assert err.startswith(f"error: {tmp_path}/vendor.xml: 3 thing(s) are missing; complete ")
 
 
 def test_the_h1_unchanged(made):
