@@ -77,7 +77,7 @@ def check_mjcf(options: Check) -> None:
     """Propose the roles of an MJCF and say what is missing."""
     from forgetmimic_jax.robot.picture import draw_roles
     from forgetmimic_jax.robot.proposal import propose
-    from forgetmimic_jax.robot.vendor import Unreadable, read_mjcf
+    from forgetmimic_jax.robot.vendor import Unreadable, compiled, read_mjcf
 
     name = options.name or re.sub(r"\W+", "_", options.file.stem).strip("_").lower()
     _check_name(name)
@@ -89,7 +89,7 @@ def check_mjcf(options: Check) -> None:
         raise InputError(f"{file}: is there already, perhaps with your changes; --force replaces it")
     try:
         proposal = propose(options.file)
-        model = read_mjcf(options.file)[0].compile()
+        model = compiled(read_mjcf(options.file)[0])[0]
     except Unreadable as error:
         raise InputError(f"{options.file}: {error}") from None
     folder.mkdir(parents=True, exist_ok=True)

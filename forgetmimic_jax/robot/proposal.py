@@ -17,7 +17,7 @@ import numpy as np
 from forgetmimic_jax.robot.shapes import sphere_name
 from forgetmimic_jax.robot.standing import soles, standing
 from forgetmimic_jax.robot.tree import Tree
-from forgetmimic_jax.robot.vendor import Additions, Unreadable, read_mjcf, read_unmended
+from forgetmimic_jax.robot.vendor import Additions, Unreadable, compiled, read_mjcf, read_unmended
 
 KNEE, ELBOW = ("knee", "shin", "calf", "lower_leg"), ("elbow", "forearm", "lower_arm")
 HAND, FOOT = ("hand", "wrist", "palm", "gripper"), ("foot", "ankle", "sole")
@@ -43,12 +43,14 @@ def propose(file: Path) -> Proposal:
 
     Raises:
         Unreadable: no robot in it.
+        InputError: it is a Git LFS pointer, or a file that it names is.
     """
     spec, notes = read_mjcf(file)
     try:
-        model = spec.copy().compile()
+        model, said = compiled(spec)
     except ValueError as error:
         raise Unreadable(" ".join(str(error).split())) from None
+    notes += said
     _, vendors, _ = read_unmended(file)
     missing: list[str] = []
     fixed = [model.joint(j).name for j in range(1, model.njnt) if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE]
@@ -57,7 +59,7 @@ def propose(file: Path) -> Proposal:
             f"joints that are no hinges, welded by `fixed`: {', '.join(fixed)}; or put hinges in their place"
         )
         spec, _ = read_mjcf(file, Additions(fixed=[re.escape(joint) for joint in fixed]))
-        model = spec.copy().compile()
+        model, _ = compiled(spec)
     tree = Tree(model)
     limbs = tree.limbs()
     roles: dict[str, Any] = {"model": file.name}

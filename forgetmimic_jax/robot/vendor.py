@@ -6,15 +6,23 @@ A file that needs no mend, such as those in `robots/`, is read unchanged.
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 
+from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.robot.check import FLOOR
 from forgetmimic_jax.robot.shapes import FRICTION, KINDS, Sphere, give_way, set_shapes
+
+LFS = b"version https://git-lfs"  # how a Git LFS pointer begins
+SETTINGS = ("timestep", "integrator", "iterations", "ls_iterations")  # of <option>, which the project's settings say
+FLAGS = {"disableflags": mujoco.mjtDisableBit, "enableflags": mujoco.mjtEnableBit}
+NAMED = {"cone": mujoco.mjtCone, "jacobian": mujoco.mjtJacobian, "solver": mujoco.mjtSolver}
 
 
 @dataclass(frozen=True)
@@ -36,11 +44,14 @@ def read_mjcf(file: Path, additions: Additions | None = None) -> tuple[mujoco.Mj
 
     Raises:
         Unreadable: MuJoCo does not read it, or it holds no robot.
+        InputError: it is a Git LFS pointer, or a file that it names is.
     """
     additions = additions or Additions()
     spec, model, notes = read_unmended(file)
     _keep_inertias(spec, model)
     _keep_one_robot(spec, model, notes)
+    _set_option(spec, notes)
+    _leave_out_gravcomp(spec, notes)
     _leave_out_what_drives(spec, notes)
     _set_ground(spec, model, notes)
     _set_joints(spec, additions, notes)
@@ -53,16 +64,51 @@ def read_unmended(file: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel, list[str]]
 
     Raises:
         Unreadable: MuJoCo does not read it.
+        InputError: it is a Git LFS pointer, or a file that it names is.
     """
+    _refuse_pointer(file)
     notes: list[str] = []
     try:
-        spec = mujoco.MjSpec.from_file(str(file))
+        with warnings.catch_warnings(record=True) as said:
+            spec = mujoco.MjSpec.from_file(str(file))
+        notes += _in_a_line_each(said)
+        for name, folder in _files(spec, file):
+            _refuse_pointer(folder / name)
         _leave_out_missing_meshes(spec, file, notes)
         _leave_out_missing_textures(spec, file, notes)
         _name_all(spec)
-        return spec, spec.copy().compile(), notes
+        return spec, compiled(spec.copy())[0], notes  # warnings that the mends leave come again
     except (ValueError, OSError, RuntimeError) as error:
         raise Unreadable(f"{file.name} is no MJCF that MuJoCo reads: {' '.join(str(error).split())}") from None
+
+
+def compiled(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, list[str]]:
+    """The model, and MuJoCo's warnings, a line each, which it does not print itself."""
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        model = spec.compile()
+    return model, _in_a_line_each(said)
+
+
+def _in_a_line_each(said: Sequence[warnings.WarningMessage]) -> list[str]:
+    return list(dict.fromkeys(f"MuJoCo says: {' '.join(str(one.message).split())}" for one in said))
+
+
+def _files(spec: mujoco.MjSpec, file: Path) -> list[tuple[str, Path]]:
+    """The files that an MJCF names, each with its folder."""
+    meshes = [mesh.file for mesh in spec.meshes]
+    textures = [name for texture in spec.textures for name in (texture.file, *texture.cubefiles)]
+    folders = ((meshes, file.parent / spec.meshdir), (textures, file.parent / spec.texturedir))
+    return [(name, folder) for names, folder in folders for name in names]
+
+
+def _refuse_pointer(file: Path) -> None:
+    """A file that Git LFS has not fetched."""
+    if not file.is_file():
+        return
+    with file.open("rb") as content:
+        if content.read(len(LFS)) == LFS:
+            raise InputError(f"{file}: this is a Git LFS pointer, not the file: run git lfs pull")
 
 
 def _leave_out_missing_meshes(spec: mujoco.MjSpec, file: Path, notes: list[str]) -> None:
@@ -112,12 +158,15 @@ def _name_all(spec: mujoco.MjSpec) -> None:
 
 
 def _keep_inertias(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
-    """Masses that follow from shapes stay, whatever becomes of the shapes."""
+    """Masses that follow from shapes or from a total stay, whatever becomes of the shapes."""
+    scaled = spec.compiler.settotalmass > 0.0
     for body in spec.bodies[1:]:
-        if not body.explicitinertial:
+        if scaled or not body.explicitinertial:
             here = model.body(body.name)
             body.explicitinertial = True
+            body.fullinertia = [np.nan] + [0.0] * 5
             body.mass, body.ipos, body.iquat, body.inertia = here.mass[0], here.ipos, here.iquat, here.inertia
+    spec.compiler.settotalmass = -1.0
 
 
 def _keep_one_robot(spec: mujoco.MjSpec, model: mujoco.MjModel, notes: list[str]) -> None:
@@ -177,6 +226,36 @@ def _lowest(model: mujoco.MjModel) -> float:
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     return float(min(data.xpos[1:, 2].min(), -0.1))
+
+
+def _set_option(spec: mujoco.MjSpec, notes: list[str]) -> None:
+    """The project's physics: gravity, air, contacts and flags that a vendor's <option> changes."""
+    own, ours = spec.option, mujoco.MjSpec().option
+    own.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)  # of no effect on the project's integrator
+    for name in (name for name in dir(ours) if not name.startswith("_") and name not in SETTINGS):
+        found, expected = (_option_in_words(name, getattr(option, name)) for option in (own, ours))
+        setattr(own, name, getattr(ours, name))
+        if found != expected:
+            notes.append(f"<option> {name}: {found} is replaced by {expected}")
+
+
+def _option_in_words(name: str, value: Any) -> str:
+    """A field of <option>: flags and kinds by name, otherwise its numbers."""
+    if name in FLAGS:
+        flags = [each for each, flag in FLAGS[name].__members__.items() if "_" in each and value & int(flag)]
+        return " ".join(each.split("_")[1].lower() for each in flags) or "none"
+    if name in NAMED:
+        return NAMED[name](value).name.split("_")[1].lower()
+    return " ".join(f"{part:g}" for part in np.atleast_1d(value))
+
+
+def _leave_out_gravcomp(spec: mujoco.MjSpec, notes: list[str]) -> None:
+    """Bodies that gravity does not pull."""
+    light = [body for body in spec.bodies if body.gravcomp]
+    for body in light:
+        body.gravcomp = 0.0
+    if light:
+        notes.append(f"gravcomp is left out: {', '.join(body.name for body in light)}")
 
 
 def _leave_out_what_drives(spec: mujoco.MjSpec, notes: list[str]) -> None:

@@ -2,6 +2,7 @@
 
 import re
 import sys
+import warnings
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -364,6 +365,72 @@ def test_a_floor_of_the_vendor_s_is_replaced_where_it_is_not_level_ground(writte
     floor = spec.compile().geom("floor")
     assert (floor.type, floor.pos[2], floor.quat[0]) == (mujoco.mjtGeom.mjGEOM_PLANE, 0.0, 1.0)
     assert any(note.startswith("the ground is ") for note in notes)
+
+
+@pytest.mark.parametrize(
+    ("option", "note"),
+    [
+        ('gravity="0 0 0"', "gravity: 0 0 0 is replaced by 0 0 -9.81"),
+        ('density="1000" wind="9 0 0"', "wind: 9 0 0 is replaced by 0 0 0"),
+        ('actuatorgroupdisable="0"', "disableactuator: 1 is replaced by 0"),
+        ('solver="PGS" timestep="0.1"', "solver: pgs is replaced by newton"),
+        ('><flag gravity="disable" contact="disable"/></option', "disableflags: contact gravity is replaced by none"),
+        ('o_solref="0.5 1"><flag override="enable"/></option', "enableflags: override is replaced by none"),
+    ],
+)
+def test_the_vendor_s_option_is_replaced_by_the_project_s(written, option, note):
+    end = "" if "</" in option else "/"
+    spec, notes = read_mjcf(written(("<worldbody>", f"<option {option}{end}><worldbody>")))
+    assert f"<option> {note}" in notes
+    assert not any("timestep" in note for note in notes)  # the project's settings say it, whatever the file does
+    found, ours = spec.compile().opt, mujoco.MjSpec().compile().opt
+    for field in ("gravity", "density", "wind", "disableactuator", "solver", "disableflags", "enableflags", "o_solref"):
+        np.testing.assert_array_equal(getattr(found, field), getattr(ours, field), err_msg=field)
+
+
+@pytest.mark.parametrize("gravity", ["option", "gravcomp"])
+def test_a_robot_that_gravity_does_not_pull_is_held_by_its_motors_alone(written, made, gravity):
+    """With motors of 1 N m it stands only where nothing weighs."""
+    file = written()
+    text = re.sub(r'ctrlrange="[^"]*"', 'ctrlrange="-1 1"', file.read_text())
+    if gravity == "option":
+        text = text.replace("<worldbody>", '<option gravity="0 0 0"/><worldbody>')
+    else:
+        text = re.sub("<body ", '<body gravcomp="1" ', text)
+    file.write_text(text)
+    assert not hold(made(file)[0]).stands
+
+
+@pytest.mark.parametrize("name", ["vendor.xml", "shell.stl", "skin.png"])
+def test_a_git_lfs_pointer(run, written, tmp_path, name):
+    files = '<mesh name="shell" file="shell.stl"/><texture name="skin" type="2d" file="skin.png"/>'
+    file = written(("<worldbody>", f"<asset>{files}</asset><worldbody>"))
+    (tmp_path / name).write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n")
+    message = f"error: {tmp_path / name}: this is a Git LFS pointer, not the file: run git lfs pull\n"
+    assert run("check", file) == (2, "", message)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_total_mass_is_kept_and_no_warning_of_mujoco_is_printed(written, made):
+    """Robot and crate weigh 39 + 64 kg, and by `settotalmass`, which MuJoCo calls deprecated, twice as much."""
+    plain = read_mjcf(written())[0].compile()
+    robot, _ = made(written(('angle="radian"', 'angle="radian" settotalmass="206"')))
+    assert float(robot.arrays.mass) == pytest.approx(78.0)
+    for body in ("base", "left_shin"):
+        np.testing.assert_allclose(robot.model.body(body).inertia, 2.0 * plain.body(body).inertia, rtol=1e-6)
+
+
+@pytest.mark.filterwarnings("error")
+def test_what_mujoco_warns_of_is_said_once(written, made, monkeypatch):
+    compile_spec = mujoco.MjSpec.compile
+
+    def warns(spec):
+        warnings.warn("two\nlines", stacklevel=1)
+        return compile_spec(spec)
+
+    monkeypatch.setattr(mujoco.MjSpec, "compile", warns)
+    _, proposal = made(written())
+    assert proposal.notes.count("MuJoCo says: two lines") == 1
 
 
 def test_our_own_robots_need_no_mend():
