@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from forgetmimic_jax.basics.console import closing, command_line
+from forgetmimic_jax.basics.console import closing, command_line, warn
 from forgetmimic_jax.basics.errors import InputError, run_command
 from forgetmimic_jax.settings.options import parse
 
@@ -104,6 +104,8 @@ def check_mjcf(options: Check) -> None:
             missing = [line.removeprefix(f"{file.resolve()}: ") for line in str(error).splitlines()]
             file.write_text(yaml_of(replace(proposal, missing=missing), options.file.resolve()))
     print("\n".join(f"missing: {line}" for line in missing))
+    for line in proposal.doubts:
+        warn(line)
     following = f"check {file}" if missing else f"add {file}"
     closing({"roles": file, "picture": folder / f"{name}.png"}, command_line("robot", following))
     if missing:
@@ -126,7 +128,7 @@ def add(options: Add) -> None:
     mjcf = options.file.parent / roles.model
     if not Path(roles.model).is_absolute():
         shutil.copyfile(mjcf, folder / roles.model)
-    closing({"robot": folder}, command_line("motions", "import FILE", robot=name))
+    closing({"robot": folder}, command_line("motions", "import MOTION.csv --fps 30", robot=name))
 
 
 def yaml_of(proposal: Proposal, mjcf: Path) -> str:
@@ -135,6 +137,7 @@ def yaml_of(proposal: Proposal, mjcf: Path) -> str:
 
     head = [f"# Roles proposed for {mjcf.name}. Check them against the picture beside this file.", "# Missing:"]
     head += [f"# - {line}" for line in proposal.missing] or ["# - nothing"]
+    head += ["# Doubtful:", *(f"# - {line}" for line in proposal.doubts)] if proposal.doubts else []
     head += ["# Mended when the MJCF is read:", *(f"# - {line}" for line in proposal.notes)]
     head += ["# No MJCF says a motor's speed (rad/s); armatures follow from torques. Put in the maker's figures."]
     roles = {**proposal.roles, "model": str(mjcf)}

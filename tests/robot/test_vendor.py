@@ -521,6 +521,7 @@ def test_check_then_add(run, written, monkeypatch, tmp_path):
     monkeypatch.setattr(robot_model, "ROBOTS_DIR", tmp_path / "added")
     code, out, _ = run("add", "runs/robots/vendor/vendor.yaml")
     assert code == 0
+    assert out.endswith("Next: make motions ARGS='import MOTION.csv --fps 30' ROBOT=vendor\n")
     assert load_robot("vendor", robots_dir=tmp_path / "added").num_joints == 17
     assert "a robot of this name is there" in run("add", "runs/robots/vendor/vendor.yaml")[2]
 
@@ -550,6 +551,27 @@ def test_a_yaml_that_was_completed_is_checked(run, written, tmp_path):
     assert (code, err) == (0, "")
     assert "holds its default pose for 1 s" in out
     assert out.endswith(f"Next: make robot ARGS='add {file}'\n")
+
+
+def test_radians_that_are_read_as_degrees_are_found_by_check_and_by_add(run, written):
+    """A leg's ranges are 1, 4, 2.5 and 1.5; 2 degrees are 0.035 rad."""
+    line = "ranges of the legs' joints: found a median of 0.035 rad; are they radians? Mend, in the MJCF: "
+    code, out, _ = run("check", written(('angle="radian"', 'angle="degree"')))
+    assert (code, f"missing: {line}" in out) == (2, True)
+    code, _, err = run("add", "runs/robots/vendor/vendor.yaml")
+    assert (code, line in err) == (2, True)
+
+
+def test_names_that_say_the_other_side_are_doubted(run, written, tmp_path):
+    """A robot that faces -x has its left at negative y."""
+    file = written()
+    swapped = re.sub("left_|right_", lambda side: {"left_": "right_", "right_": "left_"}[side[0]], file.read_text())
+    file.write_text(swapped)
+    code, _, err = run("check", file)
+    line = "pairs: left is 'right_upper' and right is 'left_upper': the names say the other side: does it face -x?"
+    assert (code, err) == (0, f"warning: {line}\n")
+    assert f"# - {line}" in (tmp_path / "runs/robots/vendor/vendor.yaml").read_text().splitlines()
+    assert propose(written()).doubts == []
 
 
 def test_limbs_that_are_not_alike_are_found_by_check(run, written, tmp_path):
