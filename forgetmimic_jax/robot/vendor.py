@@ -9,6 +9,7 @@ import re
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +71,7 @@ def read_unmended(file: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel, list[str]]
     notes: list[str] = []
     try:
         with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
             spec = mujoco.MjSpec.from_file(str(file))
         notes += _in_a_line_each(said)
         for name, folder in _files(spec, file):
@@ -77,7 +79,9 @@ def read_unmended(file: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel, list[str]]
         _leave_out_missing_meshes(spec, file, notes)
         _leave_out_missing_textures(spec, file, notes)
         _name_all(spec)
-        return spec, compiled(spec.copy())[0], notes  # warnings that the mends leave come again
+        whole = spec.copy()
+        whole.compiler.fusestatic = False  # every body stays, those without a joint too
+        return spec, compiled(whole)[0], notes  # warnings that the mends leave come again
     except (ValueError, OSError, RuntimeError) as error:
         raise Unreadable(f"{file.name} is no MJCF that MuJoCo reads: {' '.join(str(error).split())}") from None
 
@@ -147,14 +151,16 @@ def _is_missing(name: str, folder: Path) -> bool:
 
 def _name_all(spec: mujoco.MjSpec) -> None:
     """Names for bodies and joints that have none."""
-    taken = {body.name for body in spec.bodies}
+    taken, joints = {body.name for body in spec.bodies}, {joint.name for joint in spec.joints}
     for body in spec.bodies:
         if not body.name:
             body.name = next(name for number in range(len(taken) + 1) if (name := f"body{number}") not in taken)
             taken.add(body.name)
     for joint in spec.joints:
         if not joint.name and joint.type != mujoco.mjtJoint.mjJNT_FREE:
-            joint.name = f"{joint.parent.name}_joint{joint.parent.joints.index(joint)}"
+            first, stem = joint.parent.joints.index(joint), f"{joint.parent.name}_joint"
+            joint.name = next(name for number in count(first) if (name := f"{stem}{number}") not in joints)
+            joints.add(joint.name)
 
 
 def _keep_inertias(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
@@ -195,7 +201,7 @@ def _keep_one_robot(spec: mujoco.MjSpec, model: mujoco.MjModel, notes: list[str]
     elif own and own[0].type != mujoco.mjtJoint.mjJNT_FREE:
         raise Unreadable(f"{root.name} hangs on the world by a hinge; mend: put <freejoint/> in its place")
     if not any(joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in root.joints):
-        if _rigid_mass(root, model) <= 0.0:
+        if _rigid_mass(root) <= 0.0:
             raise Unreadable(
                 f"{root.name} floats and has no mass; mend: give it one (<inertial>), or take away the joints of the "
                 "body that it carries"
@@ -211,10 +217,9 @@ def _joints_below(body: mujoco.MjsBody) -> list[mujoco.MjsJoint]:
     return own + [joint for child in body.bodies for joint in _joints_below(child)]
 
 
-def _rigid_mass(body: mujoco.MjsBody, model: mujoco.MjModel) -> float:
+def _rigid_mass(body: mujoco.MjsBody) -> float:
     """kg of a body and of what it carries without a joint."""
-    welded = sum(_rigid_mass(child, model) for child in body.bodies if not child.joints)
-    return float(model.body(body.name).mass[0]) + welded
+    return float(body.mass) + sum(_rigid_mass(child) for child in body.bodies if not child.joints)
 
 
 def _names_below(body: mujoco.MjsBody) -> list[str]:

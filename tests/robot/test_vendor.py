@@ -357,6 +357,23 @@ def test_a_shape_whose_name_the_project_needs_is_called_otherwise(written, made,
     assert model.body(model.geom(name).bodyid[0]).name != "base"
 
 
+def test_a_joint_without_a_name_gets_one_that_is_free(written):
+    file = written(
+        ('<joint name="left_wrist" axis', "<joint axis"), ('name="waist" axis', 'name="left_hand_joint0" axis')
+    )
+    without = re.sub("<(actuator|sensor)>.*</(actuator|sensor)>", "", file.read_text(), flags=re.DOTALL)
+    file.write_text(without)
+    spec, _ = read_mjcf(file)
+    assert [joint.name for joint in spec.body("left_hand").joints] == ["left_hand_joint1"]
+
+
+def test_bodies_without_a_joint_may_be_fused(written, made):
+    """A URDF fuses them, into the world too."""
+    cover = '<body name="cover"><geom type="box" size="0.1 0.1 0.1" mass="3"/></body><body name="chest"'
+    robot, _ = made(written(('angle="radian"', 'angle="radian" fusestatic="true"'), ('<body name="chest"', cover)))
+    assert float(robot.arrays.mass) == pytest.approx(42.0)
+
+
 @pytest.mark.parametrize("place", ['pos="0 0 -0.2"', 'euler="0.3 0 0"', 'type="box"'])
 def test_a_floor_of_the_vendor_s_is_replaced_where_it_is_not_level_ground(written, place):
     plane = '<geom name="ground" type="plane" size="5 5 0.1" pos="0 0 -0.2"/>'
