@@ -37,7 +37,7 @@ flag_value = $(if $(filter $(1),$(SWITCHES)),$(filter-out 1,$($(1))),'$(subst ',
 flag = $(if $($(1)),--$(call flag_name,$(1)) $(call flag_value,$(1)))
 FLAGS = $(foreach name,$(filter-out ARGS PYTHON SWEEP,$(given)),$(call flag,$(name)))
 
-COMMANDS = pretrain train unlearn evaluate evidence export play video report motions robot bench
+COMMANDS = pretrain train unlearn evaluate evidence export play video report motions robot import-policy bench
 STUDIES = validity comparison penalty heat_map motion_types physical_behaviour training_dynamics relearning membership \
 	number_of_targets stand overlap generality from_scratch
 
@@ -48,8 +48,8 @@ STUDIES = validity comparison penalty heat_map motion_types physical_behaviour t
 help: ## this list
 	@echo 'make TARGET [VARIABLE=value ...]'
 	@echo
-	@sed -n 's/^\([a-z]*\):.*## \(.*\)/\1|\2/p' Makefile | \
-		while IFS='|' read -r name text; do printf '  %-12s %s\n' "$$name" "$$text"; done
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' Makefile | \
+		while IFS='|' read -r name text; do printf '  %-13s %s\n' "$$name" "$$text"; done
 	@echo
 	@sed -n 's/^## /  /p' Makefile
 
@@ -64,6 +64,7 @@ video: ## film CHECKPOINT clip by clip, beside its base: MP4, GIF and a page of 
 report: ## write one HTML page about the unlearning run in RUN
 robot: ## make a robot of a vendor's MJCF (ARGS=--help says how)
 motions: ## make a library from your own clips (ARGS=--help says how)
+import-policy: ## make a base of policies of other projects (ARGS="a.onnx b.onnx")
 bench: ## measure the speed of training on this machine
 $(COMMANDS): .venv/.installed
 	$(PROGRAM) $@ $(strip $(ARGS) $(FLAGS))

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import re
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from forgetmimic_jax.basics.console import closing, command_line
+from forgetmimic_jax.basics.console import closing, command_line, warn
 from forgetmimic_jax.basics.errors import InputError, run_command
 from forgetmimic_jax.settings.options import parse
 
@@ -23,10 +23,10 @@ class Check:
     """Say what an MJCF lacks, each with its mend, and propose the YAML of its roles.
 
     The YAML and a picture of the roles are written to runs/robots/NAME. Where nothing is missing, the robot holds its
-    default pose for 1 s in simulation."""
+    default pose for 1 s in simulation. A YAML that you completed is checked in the same way."""
 
     file: tyro.conf.Positional[Path]
-    """The MJCF, as its vendor publishes it."""
+    """The MJCF, as its vendor publishes it; or the YAML of its roles."""
     name: str | None = None
     """Name of the robot; the file's by default."""
     force: bool = False
@@ -64,10 +64,20 @@ def main(options: Options) -> None:
 
 
 def check(options: Check) -> None:
+    """Propose the roles of an MJCF and say what is missing; or check a YAML of roles."""
+    if options.file.suffix == ".yaml":
+        _check_home(options.file)
+        print(_try(options.file))
+        closing({"roles": options.file}, command_line("robot", f"add {options.file}"))
+    else:
+        check_mjcf(options)
+
+
+def check_mjcf(options: Check) -> None:
     """Propose the roles of an MJCF and say what is missing."""
     from forgetmimic_jax.robot.picture import draw_roles
     from forgetmimic_jax.robot.proposal import propose
-    from forgetmimic_jax.robot.vendor import Unreadable, read_mjcf
+    from forgetmimic_jax.robot.vendor import Unreadable, compiled, read_mjcf
 
     name = options.name or re.sub(r"\W+", "_", options.file.stem).strip("_").lower()
     _check_name(name)
@@ -79,21 +89,27 @@ def check(options: Check) -> None:
         raise InputError(f"{file}: is there already, perhaps with your changes; --force replaces it")
     try:
         proposal = propose(options.file)
-        model = read_mjcf(options.file)[0].compile()
+        model = compiled(read_mjcf(options.file)[0])[0]
     except Unreadable as error:
         raise InputError(f"{options.file}: {error}") from None
     folder.mkdir(parents=True, exist_ok=True)
     file.write_text(yaml_of(proposal, options.file.resolve()))
     draw_roles(model, proposal.roles, folder / f"{name}.png")
     print("\n".join(f"mended: {note}" for note in proposal.notes))
-    print("\n".join(f"missing: {line}" for line in proposal.missing))
-    if not proposal.missing:
-        print(_try(file))
-    closing({"roles": file, "picture": folder / f"{name}.png"}, command_line("robot", f"add {file}"))
-    if proposal.missing:
-        raise InputError(
-            f"{options.file}: {len(proposal.missing)} thing(s) are missing; complete {file}, then robot add"
-        )
+    missing = proposal.missing
+    if not missing:
+        try:
+            print(_try(file))
+        except InputError as error:
+            missing = [line.removeprefix(f"{file.resolve()}: ") for line in str(error).splitlines()]
+            file.write_text(yaml_of(replace(proposal, missing=missing), options.file.resolve()))
+    print("\n".join(f"missing: {line}" for line in missing))
+    for line in proposal.doubts:
+        warn(line)
+    following = f"check {file}" if missing else f"add {file}"
+    closing({"roles": file, "picture": folder / f"{name}.png"}, command_line("robot", following))
+    if missing:
+        raise InputError(f"{options.file}: {len(missing)} thing(s) are missing; complete {file}, then check it")
 
 
 def add(options: Add) -> None:
@@ -102,11 +118,7 @@ def add(options: Add) -> None:
     from forgetmimic_jax.robot.roles import read_roles
 
     name = options.file.stem
-    _check_name(name)
-    if not options.file.is_file():
-        raise InputError(f"{options.file}: not found")
-    if options.file.resolve().parent.name != name:
-        raise InputError(f"{options.file}: put it into a folder of its name: {name}/{name}.yaml")
+    _check_home(options.file)
     roles, folder = read_roles(options.file), ROBOTS_DIR / name
     if folder.exists() and not options.force:
         raise InputError(f"{folder}: a robot of this name is there; give the YAML another name, or --force")
@@ -116,7 +128,7 @@ def add(options: Add) -> None:
     mjcf = options.file.parent / roles.model
     if not Path(roles.model).is_absolute():
         shutil.copyfile(mjcf, folder / roles.model)
-    closing({"robot": folder}, command_line("motions", "import FILE", robot=name))
+    closing({"robot": folder}, command_line("motions", "import MOTION.csv --fps 30", robot=name))
 
 
 def yaml_of(proposal: Proposal, mjcf: Path) -> str:
@@ -125,6 +137,7 @@ def yaml_of(proposal: Proposal, mjcf: Path) -> str:
 
     head = [f"# Roles proposed for {mjcf.name}. Check them against the picture beside this file.", "# Missing:"]
     head += [f"# - {line}" for line in proposal.missing] or ["# - nothing"]
+    head += ["# Doubtful:", *(f"# - {line}" for line in proposal.doubts)] if proposal.doubts else []
     head += ["# Mended when the MJCF is read:", *(f"# - {line}" for line in proposal.notes)]
     head += ["# No MJCF says a motor's speed (rad/s); armatures follow from torques. Put in the maker's figures."]
     roles = {**proposal.roles, "model": str(mjcf)}
@@ -140,6 +153,15 @@ def _try(file: Path) -> str:
     held = hold(robot)
     verdict = "holds its default pose for 1 s" if held.stands else "warning: does not hold its default pose for 1 s"
     return f"{robot.name}: {robot.num_joints} joints, {float(robot.arrays.mass):.1f} kg; {verdict}: {held}"
+
+
+def _check_home(file: Path) -> None:
+    """A YAML lies in a folder of its name."""
+    _check_name(file.stem)
+    if not file.is_file():
+        raise InputError(f"{file}: not found")
+    if file.resolve().parent.name != file.stem:
+        raise InputError(f"{file}: put it into a folder of its name: {file.stem}/{file.stem}.yaml")
 
 
 def _check_name(name: str) -> None:

@@ -7,12 +7,14 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import mujoco
+import numpy as np
 
 from forgetmimic_jax.basics.errors import nearest
 from forgetmimic_jax.robot.sides import body_ids, side_problems
 
 HINGE = mujoco.mjtJoint.mjJNT_HINGE
 FLOOR = "floor"  # the name of the ground's geom
+NARROW = 0.1  # rad; half of the legs' joints have less only where radians were read as degrees
 
 
 def misfits(roles: Mapping[str, Any], model: mujoco.MjModel) -> Iterator[str]:
@@ -38,6 +40,23 @@ def misfits(roles: Mapping[str, Any], model: mujoco.MjModel) -> Iterator[str]:
     yield from _joints(roles, joints)
 
 
+def narrow_ranges(model: mujoco.MjModel, feet: Iterable[str]) -> Iterator[str]:
+    """Ranges of the legs' joints that are too narrow for any robot, a line."""
+    legs = set()
+    for foot in feet:
+        body = model.body(foot).id
+        while body:
+            legs.add(body)
+            body = int(model.body_parentid[body])
+    of_legs = np.isin(model.jnt_bodyid, list(legs)) & (model.jnt_type == HINGE) & (model.jnt_limited > 0)
+    ranges = np.ptp(model.jnt_range[of_legs], axis=1)
+    if len(ranges) and np.median(ranges) < NARROW:
+        yield (
+            f"ranges of the legs' joints: found a median of {np.median(ranges):.2g} rad; are they radians? Mend, in "
+            'the MJCF: <compiler angle="radian"/>, then robot check with --force'
+        )
+
+
 def first_match(rules: Iterable[tuple[str, str]], joint: str) -> str | None:
     """The second of the first (pattern, ...) whose pattern is the whole of the joint's name."""
     return next((given for pattern, given in rules if re.fullmatch(pattern, joint)), None)
@@ -54,6 +73,7 @@ def _bodies(roles: Mapping[str, Any], model: mujoco.MjModel) -> Iterator[str]:
             yield f"{field}: no body '{name}' in {roles['model']}; {nearest(name, bodies)}"
     if "pairs" in roles and not any(unknown[field] for field in unknown if field.startswith("pairs")):
         yield from (f"pairs: {line}" for line in side_problems(model, body_ids(model, roles["pairs"])))
+        yield from narrow_ranges(model, roles["pairs"].feet)
     if "key_bodies" not in roles:
         return
     for field in ("anchor", "end_effectors", "pairs: feet"):

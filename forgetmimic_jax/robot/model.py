@@ -22,7 +22,7 @@ from forgetmimic_jax.basics.places import shipped
 from forgetmimic_jax.robot.check import FLOOR
 from forgetmimic_jax.robot.roles import Roles, read_roles
 from forgetmimic_jax.robot.sides import Pairs, body_ids, counterparts, sides_of_bodies
-from forgetmimic_jax.robot.vendor import read_mjcf
+from forgetmimic_jax.robot.vendor import compiled, read_mjcf
 from forgetmimic_jax.settings.config import ActionConfig, PhysicsConfig
 
 ROBOTS_DIR = shipped("robots")
@@ -268,7 +268,7 @@ def _resolved(
     name: str, roles: Roles, spec: mujoco.MjSpec, drives: Sequence[Drive], policy_joints: np.ndarray
 ) -> Robot:
     """The roles as indices into the compiled model."""
-    model = spec.compile()
+    model, _ = compiled(spec)
     key_bodies, joint_names = roles.key_bodies, tuple(drive.joint for drive in drives)
     root = model.body(1).name
     pairs = body_ids(model, roles.pairs)

@@ -14,10 +14,11 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from forgetmimic_jax.robot.check import narrow_ranges
 from forgetmimic_jax.robot.shapes import sphere_name
 from forgetmimic_jax.robot.standing import soles, standing
-from forgetmimic_jax.robot.tree import Tree
-from forgetmimic_jax.robot.vendor import Additions, Unreadable, read_mjcf, read_unmended
+from forgetmimic_jax.robot.tree import Tree, says_other_side
+from forgetmimic_jax.robot.vendor import Additions, Unreadable, compiled, read_mjcf, read_unmended
 
 KNEE, ELBOW = ("knee", "shin", "calf", "lower_leg"), ("elbow", "forearm", "lower_arm")
 HAND, FOOT = ("hand", "wrist", "palm", "gripper"), ("foot", "ankle", "sole")
@@ -31,11 +32,12 @@ SPEED = 20.0  # rad/s, a motor's, which no MJCF says
 
 @dataclass(frozen=True)
 class Proposal:
-    """The YAML's fields, what was mended or assumed, and what the user has to say."""
+    """The YAML's fields, what was mended or assumed, what the user has to say, and what looks wrong."""
 
     roles: dict[str, Any]
     notes: list[str]
     missing: list[str]  # with the mend, a line each
+    doubts: list[str]
 
 
 def propose(file: Path) -> Proposal:
@@ -43,12 +45,14 @@ def propose(file: Path) -> Proposal:
 
     Raises:
         Unreadable: no robot in it.
+        InputError: it is a Git LFS pointer, or a file that it names is.
     """
     spec, notes = read_mjcf(file)
     try:
-        model = spec.copy().compile()
+        model, said = compiled(spec)
     except ValueError as error:
         raise Unreadable(" ".join(str(error).split())) from None
+    notes += said
     _, vendors, _ = read_unmended(file)
     missing: list[str] = []
     fixed = [model.joint(j).name for j in range(1, model.njnt) if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE]
@@ -57,7 +61,7 @@ def propose(file: Path) -> Proposal:
             f"joints that are no hinges, welded by `fixed`: {', '.join(fixed)}; or put hinges in their place"
         )
         spec, _ = read_mjcf(file, Additions(fixed=[re.escape(joint) for joint in fixed]))
-        model = spec.copy().compile()
+        model, _ = compiled(spec)
     tree = Tree(model)
     limbs = tree.limbs()
     roles: dict[str, Any] = {"model": file.name}
@@ -70,6 +74,7 @@ def propose(file: Path) -> Proposal:
         missing.append(
             f"limits of the joints {', '.join(endless)}; mend, in the YAML: ranges: {{{endless[0]}: [lower, upper]}}"
         )
+    missing += narrow_ranges(model, roles.get("pairs", {}).get("feet", ()))
     if fixed:
         roles["fixed"] = [re.escape(joint) for joint in fixed]
     spheres = _spheres(model, roles, notes)
@@ -77,7 +82,7 @@ def propose(file: Path) -> Proposal:
         roles["spheres"] = spheres
     roles["head"] = _head(model, spheres)
     roles |= standing(tree, roles, _keyframe(vendors, model))
-    return Proposal(roles, notes, missing)
+    return Proposal(roles, notes, missing, _swapped(roles))
 
 
 def _bodies(tree: Tree, limbs: Sequence[tuple[int, int]], missing: list[str]) -> dict[str, Any]:
@@ -168,6 +173,16 @@ def _motors(model: mujoco.MjModel, limits: Mapping[str, float], missing: list[st
             f"m^2, about {ARMATURE_PER_TORQUE:g} times the effort), or several motors"
         )
     return {"motors": motors, "joint_motors": rules}
+
+
+def _swapped(roles: Mapping[str, Any]) -> list[str]:
+    """Pairs whose left is right by the names, a line."""
+    pairs = list(roles.get("pairs", {}).values())
+    found = [pair for pair in pairs if says_other_side(*pair)]
+    if 2 * len(found) <= len(pairs):
+        return []
+    left, right = found[0]
+    return [f"pairs: left is '{left}' and right is '{right}': the names say the other side: does it face -x?"]
 
 
 def _spheres(model: mujoco.MjModel, roles: Mapping[str, Any], notes: list[str]) -> list[list[Any]]:

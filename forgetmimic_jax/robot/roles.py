@@ -15,7 +15,7 @@ import yaml
 from forgetmimic_jax.basics.errors import InputError, nearest
 from forgetmimic_jax.robot.check import first_match, misfits
 from forgetmimic_jax.robot.sides import Pairs
-from forgetmimic_jax.robot.vendor import Additions, Unreadable, read_mjcf
+from forgetmimic_jax.robot.vendor import Additions, Unreadable, compiled, read_mjcf
 
 T = TypeVar("T")
 
@@ -109,7 +109,7 @@ def _model(file: Path, values: Mapping[str, Any]) -> mujoco.MjModel:
         raise _Wrong(f"no file '{file.name}'")
     additions = {name: values[name] for name in ("fixed", "ranges", "spheres") if name in values}
     try:
-        return read_mjcf(file, Additions(**additions))[0].compile()
+        return compiled(read_mjcf(file, Additions(**additions))[0])[0]
     except Unreadable as error:
         raise _Wrong(str(error)) from None
     except ValueError as error:

@@ -24,7 +24,9 @@ def set_shapes(spec: mujoco.MjSpec, spheres: Sequence[Sphere], notes: list[str])
         kind = KINDS(geom.type)
         touches = bool(geom.contype or geom.conaffinity)
         if touches and not geom.name:
-            geom.name = f"{geom.parent.name}_shape{list(geom.parent.geoms).index(geom)}"
+            name = f"{geom.parent.name}_shape{list(geom.parent.geoms).index(geom)}"
+            give_way(spec, name, notes)
+            geom.name = name
         if kind not in PRIMITIVES and (touches or kind == KINDS.mjGEOM_MESH):
             changed[kind.name.removeprefix("mjGEOM_").lower()] = changed.get(kind.name, 0) + 1
             _make_capsule(geom)
@@ -40,6 +42,7 @@ def set_shapes(spec: mujoco.MjSpec, spheres: Sequence[Sphere], notes: list[str])
     for number, (body, *place, radius) in enumerate(spheres):
         parent = spec.body(body)
         if parent is not None:
+            give_way(spec, sphere_name(body, number), notes)
             parent.add_geom(
                 name=sphere_name(body, number),
                 type=KINDS.mjGEOM_SPHERE,
@@ -56,6 +59,15 @@ def set_shapes(spec: mujoco.MjSpec, spheres: Sequence[Sphere], notes: list[str])
     if not any(geom.group == SEEN_GROUP for body in spec.bodies[1:] for geom in body.geoms):
         _add_bones(spec)
         notes.append("no shape is there to be seen: bones are drawn")
+
+
+def give_way(spec: mujoco.MjSpec, name: str, notes: list[str]) -> None:
+    """Call a vendor's shape otherwise whose name the project needs."""
+    taken = {geom.name: geom for geom in spec.geoms}
+    if name in taken:
+        other = next(other for number in range(len(taken)) if (other := f"{name}_{number}") not in taken)
+        taken[name].name = other
+        notes.append(f"the shape '{name}' of {taken[name].parent.name} is called '{other}'")
 
 
 def sphere_name(body: str, number: int) -> str:

@@ -14,6 +14,11 @@ SIDE_WORDS = (("left", "right"), ("Left", "Right"), ("l_", "r_"), ("L_", "R_"), 
 MIRROR = 0.02  # m that a body may lie from its counterpart's mirror image
 
 
+def says_other_side(left: str, right: str) -> bool:
+    """Whether a left body has a right one's name, and a right body the left one's."""
+    return left != right and any(left.replace(b, a) == right for a, b in SIDE_WORDS)
+
+
 class Tree:
     """The bodies of a model in its zero pose, its root upright at the origin."""
 

@@ -6,15 +6,24 @@ A file that needs no mend, such as those in `robots/`, is read unchanged.
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 
+from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.robot.check import FLOOR
-from forgetmimic_jax.robot.shapes import FRICTION, KINDS, Sphere, set_shapes
+from forgetmimic_jax.robot.shapes import FRICTION, KINDS, Sphere, give_way, set_shapes
+
+LFS = b"version https://git-lfs"  # how a Git LFS pointer begins
+SETTINGS = ("timestep", "integrator", "iterations", "ls_iterations")  # of <option>, which the project's settings say
+FLAGS = {"disableflags": mujoco.mjtDisableBit, "enableflags": mujoco.mjtEnableBit}
+NAMED = {"cone": mujoco.mjtCone, "jacobian": mujoco.mjtJacobian, "solver": mujoco.mjtSolver}
 
 
 @dataclass(frozen=True)
@@ -36,13 +45,16 @@ def read_mjcf(file: Path, additions: Additions | None = None) -> tuple[mujoco.Mj
 
     Raises:
         Unreadable: MuJoCo does not read it, or it holds no robot.
+        InputError: it is a Git LFS pointer, or a file that it names is.
     """
     additions = additions or Additions()
     spec, model, notes = read_unmended(file)
     _keep_inertias(spec, model)
     _keep_one_robot(spec, model, notes)
+    _set_option(spec, notes)
+    _leave_out_gravcomp(spec, notes)
     _leave_out_what_drives(spec, notes)
-    _set_ground(spec, notes)
+    _set_ground(spec, model, notes)
     _set_joints(spec, additions, notes)
     set_shapes(spec, additions.spheres, notes)
     return spec, notes
@@ -53,16 +65,54 @@ def read_unmended(file: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel, list[str]]
 
     Raises:
         Unreadable: MuJoCo does not read it.
+        InputError: it is a Git LFS pointer, or a file that it names is.
     """
+    _refuse_pointer(file)
     notes: list[str] = []
     try:
-        spec = mujoco.MjSpec.from_file(str(file))
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            spec = mujoco.MjSpec.from_file(str(file))
+        notes += _in_a_line_each(said)
+        for name, folder in _files(spec, file):
+            _refuse_pointer(folder / name)
         _leave_out_missing_meshes(spec, file, notes)
         _leave_out_missing_textures(spec, file, notes)
         _name_all(spec)
-        return spec, spec.copy().compile(), notes
+        whole = spec.copy()
+        whole.compiler.fusestatic = False  # every body stays, those without a joint too
+        return spec, compiled(whole)[0], notes  # warnings that the mends leave come again
     except (ValueError, OSError, RuntimeError) as error:
         raise Unreadable(f"{file.name} is no MJCF that MuJoCo reads: {' '.join(str(error).split())}") from None
+
+
+def compiled(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, list[str]]:
+    """The model, and MuJoCo's warnings, a line each, which it does not print itself."""
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        model = spec.compile()
+    return model, _in_a_line_each(said)
+
+
+def _in_a_line_each(said: Sequence[warnings.WarningMessage]) -> list[str]:
+    return list(dict.fromkeys(f"MuJoCo says: {' '.join(str(one.message).split())}" for one in said))
+
+
+def _files(spec: mujoco.MjSpec, file: Path) -> list[tuple[str, Path]]:
+    """The files that an MJCF names, each with its folder."""
+    meshes = [mesh.file for mesh in spec.meshes]
+    textures = [name for texture in spec.textures for name in (texture.file, *texture.cubefiles)]
+    folders = ((meshes, file.parent / spec.meshdir), (textures, file.parent / spec.texturedir))
+    return [(name, folder) for names, folder in folders for name in names]
+
+
+def _refuse_pointer(file: Path) -> None:
+    """A file that Git LFS has not fetched."""
+    if not file.is_file():
+        return
+    with file.open("rb") as content:
+        if content.read(len(LFS)) == LFS:
+            raise InputError(f"{file}: this is a Git LFS pointer, not the file: run git lfs pull")
 
 
 def _leave_out_missing_meshes(spec: mujoco.MjSpec, file: Path, notes: list[str]) -> None:
@@ -101,23 +151,28 @@ def _is_missing(name: str, folder: Path) -> bool:
 
 def _name_all(spec: mujoco.MjSpec) -> None:
     """Names for bodies and joints that have none."""
-    taken = {body.name for body in spec.bodies}
+    taken, joints = {body.name for body in spec.bodies}, {joint.name for joint in spec.joints}
     for body in spec.bodies:
         if not body.name:
             body.name = next(name for number in range(len(taken) + 1) if (name := f"body{number}") not in taken)
             taken.add(body.name)
     for joint in spec.joints:
         if not joint.name and joint.type != mujoco.mjtJoint.mjJNT_FREE:
-            joint.name = f"{joint.parent.name}_joint{joint.parent.joints.index(joint)}"
+            first, stem = joint.parent.joints.index(joint), f"{joint.parent.name}_joint"
+            joint.name = next(name for number in count(first) if (name := f"{stem}{number}") not in joints)
+            joints.add(joint.name)
 
 
 def _keep_inertias(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
-    """Masses that follow from shapes stay, whatever becomes of the shapes."""
+    """Masses that follow from shapes or from a total stay, whatever becomes of the shapes."""
+    scaled = spec.compiler.settotalmass > 0.0
     for body in spec.bodies[1:]:
-        if not body.explicitinertial:
+        if scaled or not body.explicitinertial:
             here = model.body(body.name)
             body.explicitinertial = True
+            body.fullinertia = [np.nan] + [0.0] * 5
             body.mass, body.ipos, body.iquat, body.inertia = here.mass[0], here.ipos, here.iquat, here.inertia
+    spec.compiler.settotalmass = -1.0
 
 
 def _keep_one_robot(spec: mujoco.MjSpec, model: mujoco.MjModel, notes: list[str]) -> None:
@@ -144,8 +199,13 @@ def _keep_one_robot(spec: mujoco.MjSpec, model: mujoco.MjModel, notes: list[str]
             spec.delete(joint)
         notes.append(f"{len(own)} joints of {root.name} are replaced by a free joint")
     elif own and own[0].type != mujoco.mjtJoint.mjJNT_FREE:
-        raise Unreadable(f"{root.name} hangs on the world by a hinge; mend: put it into a body without a joint")
+        raise Unreadable(f"{root.name} hangs on the world by a hinge; mend: put <freejoint/> in its place")
     if not any(joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in root.joints):
+        if _rigid_mass(root) <= 0.0:
+            raise Unreadable(
+                f"{root.name} floats and has no mass; mend: give it one (<inertial>), or take away the joints of the "
+                "body that it carries"
+            )
         root.add_freejoint()
         notes.append(f"a free joint is added to {root.name}")
     if root.pos[2] <= 0.0:
@@ -157,6 +217,11 @@ def _joints_below(body: mujoco.MjsBody) -> list[mujoco.MjsJoint]:
     return own + [joint for child in body.bodies for joint in _joints_below(child)]
 
 
+def _rigid_mass(body: mujoco.MjsBody) -> float:
+    """kg of a body and of what it carries without a joint."""
+    return float(body.mass) + sum(_rigid_mass(child) for child in body.bodies if not child.joints)
+
+
 def _names_below(body: mujoco.MjsBody) -> list[str]:
     return [body.name] + [name for child in body.bodies for name in _names_below(child)]
 
@@ -166,6 +231,36 @@ def _lowest(model: mujoco.MjModel) -> float:
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     return float(min(data.xpos[1:, 2].min(), -0.1))
+
+
+def _set_option(spec: mujoco.MjSpec, notes: list[str]) -> None:
+    """The project's physics: gravity, air, contacts and flags that a vendor's <option> changes."""
+    own, ours = spec.option, mujoco.MjSpec().option
+    own.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)  # of no effect on the project's integrator
+    for name in (name for name in dir(ours) if not name.startswith("_") and name not in SETTINGS):
+        found, expected = (_option_in_words(name, getattr(option, name)) for option in (own, ours))
+        setattr(own, name, getattr(ours, name))
+        if found != expected:
+            notes.append(f"<option> {name}: {found} is replaced by {expected}")
+
+
+def _option_in_words(name: str, value: Any) -> str:
+    """A field of <option>: flags and kinds by name, otherwise its numbers."""
+    if name in FLAGS:
+        flags = [each for each, flag in FLAGS[name].__members__.items() if "_" in each and value & int(flag)]
+        return " ".join(each.split("_")[1].lower() for each in flags) or "none"
+    if name in NAMED:
+        return NAMED[name](value).name.split("_")[1].lower()
+    return " ".join(f"{part:g}" for part in np.atleast_1d(value))
+
+
+def _leave_out_gravcomp(spec: mujoco.MjSpec, notes: list[str]) -> None:
+    """Bodies that gravity does not pull."""
+    light = [body for body in spec.bodies if body.gravcomp]
+    for body in light:
+        body.gravcomp = 0.0
+    if light:
+        notes.append(f"gravcomp is left out: {', '.join(body.name for body in light)}")
 
 
 def _leave_out_what_drives(spec: mujoco.MjSpec, notes: list[str]) -> None:
@@ -194,15 +289,16 @@ def _leave_out_what_drives(spec: mujoco.MjSpec, notes: list[str]) -> None:
             notes.append(f"{len(elements)} {what} are {put}")
 
 
-def _set_ground(spec: mujoco.MjSpec, notes: list[str]) -> None:
-    """One plane called `floor`, and light."""
+def _set_ground(spec: mujoco.MjSpec, model: mujoco.MjModel, notes: list[str]) -> None:
+    """One plane called `floor`, level and at height 0, and light."""
     own = list(spec.worldbody.geoms)
-    if any(geom.name == FLOOR and geom.type == KINDS.mjGEOM_PLANE and geom.pos[2] == 0.0 for geom in own):
+    if any(geom.name == FLOOR for geom in own) and _is_ground(model, model.geom(FLOOR).id):
         spec.geom(FLOOR).contype = 1
         return
     planes = [geom for geom in own if geom.type == KINDS.mjGEOM_PLANE]
     for geom in own:
         spec.delete(geom)
+    give_way(spec, FLOOR, notes)
     spec.worldbody.add_geom(
         name=FLOOR,
         type=KINDS.mjGEOM_PLANE,
@@ -215,6 +311,14 @@ def _set_ground(spec: mujoco.MjSpec, notes: list[str]) -> None:
     if not list(spec.lights):
         spec.worldbody.add_light(pos=[0.0, 0.0, 3.0], dir=[0.0, 0.0, -1.0])
     notes.append(f"the ground is {'replaced by' if planes else 'added as'} the plane '{FLOOR}'; light is there")
+
+
+def _is_ground(model: mujoco.MjModel, geom: int) -> bool:
+    """Whether a shape of the world is a plane, level and at height 0."""
+    normal = np.zeros(3)
+    mujoco.mju_rotVecQuat(normal, np.array([0.0, 0.0, 1.0]), model.geom_quat[geom])
+    level = normal[2] > 1.0 - 1e-9 and model.geom_pos[geom, 2] == 0.0
+    return bool(level and model.geom_type[geom] == KINDS.mjGEOM_PLANE)
 
 
 def _set_joints(spec: mujoco.MjSpec, additions: Additions, notes: list[str]) -> None:

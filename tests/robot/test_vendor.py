@@ -2,6 +2,7 @@
 
 import re
 import sys
+import warnings
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -322,7 +323,12 @@ def test_everything_that_is_missing_is_said_at_once_and_can_be_given_in_the_yaml
         ("<mujoco><worldbody><body><geom size='1'/></body></worldbody></mujoco>", "no joint; a robot is a tree"),
         (
             "<mujoco><worldbody><body name='arm'><joint/><geom size='1'/></body></worldbody></mujoco>",
-            "arm hangs on the world by a hinge; mend",
+            "arm hangs on the world by a hinge; mend: put <freejoint/> in its place",
+        ),
+        (
+            "<mujoco><worldbody><body name='base'><body name='arm'><joint/><geom size='1'/></body></body></worldbody>"
+            "</mujoco>",
+            "base floats and has no mass; mend: give it one (<inertial>)",
         ),
         ("<mujoco><worldbody><body>", "no MJCF that MuJoCo reads"),
         ("no xml", "no MJCF that MuJoCo reads"),
@@ -341,6 +347,107 @@ def test_a_root_of_slides_and_hinges_is_a_free_joint(written):
     assert model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE
     assert model.nq == 7 + 17
     assert "3 joints of base are replaced by a free joint" in notes
+
+
+@pytest.mark.parametrize("name", ["floor", "left_thigh_shape0", "left_foot_sphere0"])
+def test_a_shape_whose_name_the_project_needs_is_called_otherwise(written, made, name):
+    box = '<geom type="box" size="0.1 0.1 0.05"/>'
+    model = made(written((box, box.replace("<geom", f'<geom name="{name}"'))))[0].model
+    assert model.body(model.geom(f"{name}_0").bodyid[0]).name == "base"
+    assert model.body(model.geom(name).bodyid[0]).name != "base"
+
+
+def test_a_joint_without_a_name_gets_one_that_is_free(written):
+    file = written(
+        ('<joint name="left_wrist" axis', "<joint axis"), ('name="waist" axis', 'name="left_hand_joint0" axis')
+    )
+    without = re.sub("<(actuator|sensor)>.*</(actuator|sensor)>", "", file.read_text(), flags=re.DOTALL)
+    file.write_text(without)
+    spec, _ = read_mjcf(file)
+    assert [joint.name for joint in spec.body("left_hand").joints] == ["left_hand_joint1"]
+
+
+def test_bodies_without_a_joint_may_be_fused(written, made):
+    """A URDF fuses them, into the world too."""
+    cover = '<body name="cover"><geom type="box" size="0.1 0.1 0.1" mass="3"/></body><body name="chest"'
+    robot, _ = made(written(('angle="radian"', 'angle="radian" fusestatic="true"'), ('<body name="chest"', cover)))
+    assert float(robot.arrays.mass) == pytest.approx(42.0)
+
+
+@pytest.mark.parametrize("place", ['pos="0 0 -0.2"', 'euler="0.3 0 0"', 'type="box"'])
+def test_a_floor_of_the_vendor_s_is_replaced_where_it_is_not_level_ground(written, place):
+    plane = '<geom name="ground" type="plane" size="5 5 0.1" pos="0 0 -0.2"/>'
+    kind = "" if "type" in place else 'type="plane"'
+    spec, notes = read_mjcf(written((plane, f'<geom name="floor" {kind} {place} size="5 5 0.1"/>')))
+    floor = spec.compile().geom("floor")
+    assert (floor.type, floor.pos[2], floor.quat[0]) == (mujoco.mjtGeom.mjGEOM_PLANE, 0.0, 1.0)
+    assert any(note.startswith("the ground is ") for note in notes)
+
+
+@pytest.mark.parametrize(
+    ("option", "note"),
+    [
+        ('gravity="0 0 0"', "gravity: 0 0 0 is replaced by 0 0 -9.81"),
+        ('density="1000" wind="9 0 0"', "wind: 9 0 0 is replaced by 0 0 0"),
+        ('actuatorgroupdisable="0"', "disableactuator: 1 is replaced by 0"),
+        ('solver="PGS" timestep="0.1"', "solver: pgs is replaced by newton"),
+        ('><flag gravity="disable" contact="disable"/></option', "disableflags: contact gravity is replaced by none"),
+        ('o_solref="0.5 1"><flag override="enable"/></option', "enableflags: override is replaced by none"),
+    ],
+)
+def test_the_vendor_s_option_is_replaced_by_the_project_s(written, option, note):
+    end = "" if "</" in option else "/"
+    spec, notes = read_mjcf(written(("<worldbody>", f"<option {option}{end}><worldbody>")))
+    assert f"<option> {note}" in notes
+    assert not any("timestep" in note for note in notes)  # the project's settings say it, whatever the file does
+    found, ours = spec.compile().opt, mujoco.MjSpec().compile().opt
+    for field in ("gravity", "density", "wind", "disableactuator", "solver", "disableflags", "enableflags", "o_solref"):
+        np.testing.assert_array_equal(getattr(found, field), getattr(ours, field), err_msg=field)
+
+
+@pytest.mark.parametrize("gravity", ["option", "gravcomp"])
+def test_a_robot_that_gravity_does_not_pull_is_held_by_its_motors_alone(written, made, gravity):
+    """With motors of 1 N m it stands only where nothing weighs."""
+    file = written()
+    text = re.sub(r'ctrlrange="[^"]*"', 'ctrlrange="-1 1"', file.read_text())
+    if gravity == "option":
+        text = text.replace("<worldbody>", '<option gravity="0 0 0"/><worldbody>')
+    else:
+        text = re.sub("<body ", '<body gravcomp="1" ', text)
+    file.write_text(text)
+    assert not hold(made(file)[0]).stands
+
+
+@pytest.mark.parametrize("name", ["vendor.xml", "shell.stl", "skin.png"])
+def test_a_git_lfs_pointer(run, written, tmp_path, name):
+    files = '<mesh name="shell" file="shell.stl"/><texture name="skin" type="2d" file="skin.png"/>'
+    file = written(("<worldbody>", f"<asset>{files}</asset><worldbody>"))
+    (tmp_path / name).write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n")
+    message = f"error: {tmp_path / name}: this is a Git LFS pointer, not the file: run git lfs pull\n"
+    assert run("check", file) == (2, "", message)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_total_mass_is_kept_and_no_warning_of_mujoco_is_printed(written, made):
+    """Robot and crate weigh 39 + 64 kg, and by `settotalmass`, which MuJoCo calls deprecated, twice as much."""
+    plain = read_mjcf(written())[0].compile()
+    robot, _ = made(written(('angle="radian"', 'angle="radian" settotalmass="206"')))
+    assert float(robot.arrays.mass) == pytest.approx(78.0)
+    for body in ("base", "left_shin"):
+        np.testing.assert_allclose(robot.model.body(body).inertia, 2.0 * plain.body(body).inertia, rtol=1e-6)
+
+
+@pytest.mark.filterwarnings("error")
+def test_what_mujoco_warns_of_is_said_once(written, made, monkeypatch):
+    compile_spec = mujoco.MjSpec.compile
+
+    def warns(spec):
+        warnings.warn("two\nlines", stacklevel=1)
+        return compile_spec(spec)
+
+    monkeypatch.setattr(mujoco.MjSpec, "compile", warns)
+    _, proposal = made(written())
+    assert proposal.notes.count("MuJoCo says: two lines") == 1
 
 
 def test_our_own_robots_need_no_mend():
@@ -431,6 +538,7 @@ def test_check_then_add(run, written, monkeypatch, tmp_path):
     monkeypatch.setattr(robot_model, "ROBOTS_DIR", tmp_path / "added")
     code, out, _ = run("add", "runs/robots/vendor/vendor.yaml")
     assert code == 0
+    assert out.endswith("Next: make motions ARGS='import MOTION.csv --fps 30' ROBOT=vendor\n")
     assert load_robot("vendor", robots_dir=tmp_path / "added").num_joints == 17
     assert "a robot of this name is there" in run("add", "runs/robots/vendor/vendor.yaml")[2]
 
@@ -440,7 +548,9 @@ def test_check_ends_with_2_where_something_is_missing(run, written, tmp_path):
     assert code == 2
     assert "missing: torque limits of the joints waist" in out
     assert "1 thing(s) are missing" in err
-    assert "motors: unknown: effort" in run("add", "runs/robots/vendor/vendor.yaml")[2]
+    assert out.endswith("Next: make robot ARGS='check runs/robots/vendor/vendor.yaml'\n")
+    for command in ("check", "add"):
+        assert "motors: unknown: effort" in run(command, "runs/robots/vendor/vendor.yaml")[2]
     for arguments, message in (
         (("check", "none.xml"), "not found"),
         (("check", tmp_path / "vendor.xml", "--name", "a b"), "small letters"),
@@ -448,6 +558,49 @@ def test_check_ends_with_2_where_something_is_missing(run, written, tmp_path):
     ):
         code, out, err = run(*arguments)
         assert (code, out, message in err) == (2, "", True)
+
+
+def test_a_yaml_that_was_completed_is_checked(run, written, tmp_path):
+    run("check", written(('joint="waist" ctrlrange="-60 60"', 'joint="waist"')))
+    file = Path("runs/robots/vendor/vendor.yaml")
+    file.write_text(file.read_text().replace("armature: null, effort: null", "armature: 0.01, effort: 60.0"))
+    code, out, err = run("check", file)
+    assert (code, err) == (0, "")
+    assert "holds its default pose for 1 s" in out
+    assert out.endswith(f"Next: make robot ARGS='add {file}'\n")
+
+
+def test_radians_that_are_read_as_degrees_are_found_by_check_and_by_add(run, written):
+    """A leg's ranges are 1, 4, 2.5 and 1.5; 2 degrees are 0.035 rad."""
+    line = "ranges of the legs' joints: found a median of 0.035 rad; are they radians? Mend, in the MJCF: "
+    code, out, _ = run("check", written(('angle="radian"', 'angle="degree"')))
+    assert (code, f"missing: {line}" in out) == (2, True)
+    code, _, err = run("add", "runs/robots/vendor/vendor.yaml")
+    assert (code, line in err) == (2, True)
+
+
+def test_names_that_say_the_other_side_are_doubted(run, written, tmp_path):
+    """A robot that faces -x has its left at negative y."""
+    file = written()
+    swapped = re.sub("left_|right_", lambda side: {"left_": "right_", "right_": "left_"}[side[0]], file.read_text())
+    file.write_text(swapped)
+    code, _, err = run("check", file)
+    line = "pairs: left is 'right_upper' and right is 'left_upper': the names say the other side: does it face -x?"
+    assert (code, err) == (0, f"warning: {line}\n")
+    assert f"# - {line}" in (tmp_path / "runs/robots/vendor/vendor.yaml").read_text().splitlines()
+    assert propose(written()).doubts == []
+
+
+def test_limbs_that_are_not_alike_are_found_by_check(run, written, tmp_path):
+    wrist = '<joint name="right_wrist" axis="0 0 1" range="-1 1"/>'
+    motor = '<motor name="right_wrist" joint="right_wrist" ctrlrange="-20 20"/>'
+    code, out, err = run("check", written((wrist, ""), (motor, "")))
+    assert code == 2
+    line = "pairs: hands: the left limb has 4 joints and the right one 3; accepted: as many"
+    assert f"missing: {line}" in out.splitlines()
+    assert f"# - {line}" in (tmp_path / "runs/robots/vendor/vendor.yaml").read_text().splitlines()
+    assert out.endswith("Next: make robot ARGS='check runs/robots/vendor/vendor.yaml'\n")
+    assert err.startswith(f"error: {tmp_path}/vendor.xml: 3 thing(s) are missing; complete ")
 
 
 def test_the_h1_unchanged(made):
