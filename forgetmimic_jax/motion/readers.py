@@ -13,13 +13,13 @@ from typing import Literal
 
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.motion.archives import read_npz
-from forgetmimic_jax.motion.clip import Clip
+from forgetmimic_jax.motion.clip import Clip, default_name
 from forgetmimic_jax.motion.columns import read_csv
 from forgetmimic_jax.motion.comparing import check_bodies, check_rate
 from forgetmimic_jax.motion.converting import converted
 from forgetmimic_jax.motion.pickles import read_pickle
 from forgetmimic_jax.motion.plausible import check_plausible
-from forgetmimic_jax.motion.recording import Reading, Recording, trimmed
+from forgetmimic_jax.motion.recording import MIN_SECONDS, Reading, Recording, trimmed
 from forgetmimic_jax.motion.roughness import check_jumps, spikes
 from forgetmimic_jax.robot.model import Robot
 
@@ -31,7 +31,6 @@ READERS: dict[str, Callable[[Robot, Path], Recording]] = {
     ".pickle": read_pickle,
 }
 LFS = b"version https://git-lfs"
-MIN_SECONDS = 0.5
 RATES = (5.0, 1000.0)  # Hz
 
 
@@ -70,7 +69,7 @@ def read_motion(robot: Robot, path: Path, reading: Reading | None = None) -> Rea
     notes += check_plausible(robot, recording, reading, clip, path)
     check_jumps(clip, first, path)
     notes += spikes(robot, clip, first)
-    return Read(dataclasses.replace(clip, name=reading.name or path.stem), tuple(notes))
+    return Read(dataclasses.replace(clip, name=reading.name or default_name(path)), tuple(notes))
 
 
 def _recording(robot: Robot, path: Path) -> Recording:

@@ -11,6 +11,8 @@ import numpy as np
 
 from forgetmimic_jax.basics.errors import InputError
 
+MIN_SECONDS = 0.5  # of a clip
+
 JointOrder = Literal["auto", "robot", "isaac"]
 QuaternionOrder = Literal["auto", "xyzw", "wxyz"]
 Up = Literal["z", "y"]
