@@ -83,12 +83,16 @@ def _in_robot_order(
     given = [known.get(plain(name), name) for name in names]
     missing = [joint for joint in robot.joint_names if joint not in given]
     unknown = [name for name in given if name not in robot.joint_names]
-    if unknown or len(set(given)) != len(given) or (missing and not reading.fill_missing):
+    unknown += recording.other_joints if missing else ()  # another robot's file
+    twice = sorted({name for name in given if given.count(name) > 1})
+    if unknown or twice or (missing and not reading.fill_missing):
         hint = f"; {nearest(unknown[0], missing)}" if unknown and missing else ""
-        fill = "" if unknown else "; --fill-missing holds them at their default angle"
+        named = f"; twice: {', '.join(twice)}" if twice else ""
+        fill = "" if unknown or twice else "; --fill-missing holds them at their default angle"
         raise InputError(
             f"{path}: joint_names: not {robot.name}'s {robot.num_joints} joints, each once (missing: "
-            f"{', '.join(missing) or 'none'}; unknown: {', '.join(unknown) or 'none'}){hint}{fill if missing else ''}"
+            f"{', '.join(missing) or 'none'}; unknown: {', '.join(unknown) or 'none'}{named}){hint}"
+            f"{fill if missing else ''}"
         )
     columns = np.tile(np.asarray(robot.arrays.default_joint_pos, np.float64), (len(joint_pos), 1))
     columns[:, [robot.joint_names.index(joint) for joint in given]] = joint_pos

@@ -120,7 +120,7 @@ def check_plausible(robot: Robot, recording: Recording, reading: Reading, clip: 
     here = doubt_of(robot, clip)
     if here.size < NOTICED:
         return []
-    for candidates in (_other_readings(recording, reading, 1), _other_readings(recording, reading, 2)):
+    for candidates in (other_readings(recording, reading, 1), other_readings(recording, reading, 2)):
         tried = [(_doubt(robot, recording, other, clip.fps, path), flags) for other, flags in candidates]
         best, flags = min(tried, default=(np.inf, ""))
         if best < min(BETTER * here.size, GOOD):
@@ -143,7 +143,7 @@ def check_plausible(robot: Robot, recording: Recording, reading: Reading, clip: 
     return []
 
 
-def _other_readings(recording: Recording, reading: Reading, changes: int) -> Iterator[tuple[Reading, str]]:
+def other_readings(recording: Recording, reading: Reading, changes: int) -> Iterator[tuple[Reading, str]]:
     """Every reading that differs in some fields, and the flags that ask for it."""
     used: dict[str, Any] = {**vars(reading), "quaternion": reading.quaternion.replace("auto", recording.quaternion)}
     used["joint_order"] = used["joint_order"].replace("auto", "robot")

@@ -15,7 +15,7 @@ from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.motion.archives import read_npz
 from forgetmimic_jax.motion.clip import Clip, default_name
 from forgetmimic_jax.motion.columns import read_csv
-from forgetmimic_jax.motion.comparing import check_bodies, check_rate
+from forgetmimic_jax.motion.comparing import BODY_DISTANCE, check_bodies, check_clock, check_rate, distances
 from forgetmimic_jax.motion.converting import converted
 from forgetmimic_jax.motion.pickles import read_pickle
 from forgetmimic_jax.motion.plausible import check_plausible
@@ -66,6 +66,7 @@ def read_motion(robot: Robot, path: Path, reading: Reading | None = None) -> Rea
     elif recording.joint_names is None:
         notes.append(f"joint order: unchecked, taken for {_order_name(robot, reading)} (the file names no joints)")
     notes.append(check_rate(recording, clip, path))
+    notes += check_clock(recording, clip, first)
     notes += check_plausible(robot, recording, reading, clip, path)
     check_jumps(clip, first, path)
     notes += spikes(robot, clip, first)
@@ -96,21 +97,19 @@ def _rate(recording: Recording, reading: Reading, path: Path) -> float:
 
 def _order_by_bodies(robot: Robot, recording: Recording, reading: Reading, rate: float, path: Path) -> Reading:
     """The reading whose joint order the file's bodies show; InputError where none or another than the robot's fits."""
-    fits: dict[str, str | InputError | None] = {}
-    orders: tuple[Literal["robot"], Literal["isaac"]] = ("robot", "isaac")
-    for order in orders:
-        attempt = dataclasses.replace(reading, joint_order=order)
+    orders: tuple[Literal["robot", "isaac"], ...] = ("robot", "isaac")
+    readings = {order: dataclasses.replace(reading, joint_order=order) for order in orders}
+    fits: dict[str, bool] = {}
+    for order, attempt in readings.items():
+        if order == "isaac" and recording.joint_pos.shape[1] != robot.num_joints:
+            continue  # of a variant, Isaac Lab's order is not known
         clip, _ = converted(robot, recording, attempt, rate, path)
-        try:
-            fits[order] = check_bodies(robot, recording, attempt, clip, path)
-        except InputError as error:
-            fits[order] = error
-    if isinstance(fits["robot"], str):
-        return dataclasses.replace(reading, joint_order="robot")
-    if isinstance(fits["isaac"], str):
+        found = distances(robot, recording, attempt, clip)
+        fits |= {order: max(found.values()) <= BODY_DISTANCE} if found else {}
+    if fits.get("isaac") and not fits.get("robot"):
         raise InputError(f"{path}: joint_names are missing; the bodies fit Isaac Lab's order: --joint-order isaac")
-    if isinstance(fits["robot"], InputError):
-        raise fits["robot"]
+    if "robot" in fits:
+        return readings["robot"]  # where it does not fit, `check_bodies` says so
     raise InputError(
         f"{path}: joint_names are missing, and there are no bodies to compare with, so the order is unknown; "
         f"give --joint-order robot if it is {robot.name}'s own, --joint-order isaac for Isaac Lab's"

@@ -46,7 +46,10 @@ class Recording:
     quaternion: Literal["xyzw", "wxyz"]  # the order that the format has
     joint_names: tuple[str, ...] | None = None  # of the columns of joint_pos
     order_is_given: bool = True  # the format has the robot's order where it names no joints
+    other_joints: tuple[str, ...] = ()  # that the file has besides and the robot lacks
     fps: float | None = None
+    fps_field: str = "fps"  # what of the file says its rate
+    clock: np.ndarray | None = None  # [frame] s
     joint_vel: np.ndarray | None = None  # [frame, column]
     body_names: tuple[str, ...] | None = None
     body_pos: np.ndarray | None = None  # [frame, body, 3]
