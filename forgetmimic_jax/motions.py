@@ -52,6 +52,8 @@ class Import:
     """Unit of the file's joint angles."""
     fill_missing: bool = False
     """Hold joints that the file lacks at their default angle."""
+    variant: str | None = None
+    """Variant of the robot that the file holds, where several have as many joints. With --fill-missing."""
     keep_height: bool = False
     """Leave the heights as they are. Otherwise the soles are set on the ground, at most 0.3 m away."""
     licence: str = "unknown"
@@ -151,9 +153,9 @@ def main(options: Options) -> None:
 def import_motion(robot: Robot, options: Import) -> None:
     """Make a clip of a motion file and add it to a library."""
     from forgetmimic_jax.motion import importing, library
+    from forgetmimic_jax.motion.clip import default_name
     from forgetmimic_jax.motion.recording import Reading
     from forgetmimic_jax.motion.table import quality_table
-    from forgetmimic_jax.motion.clip import default_name
 
     folder, name = options.library or Path("runs") / f"library-{robot.name}", options.name or default_name(options.file)
     library.manifest_for(folder, robot, name, importing.FPS, overwrite=options.force)

@@ -21,6 +21,7 @@ from forgetmimic_jax.motion.pickles import read_pickle
 from forgetmimic_jax.motion.plausible import check_plausible
 from forgetmimic_jax.motion.recording import MIN_SECONDS, Reading, Recording, trimmed
 from forgetmimic_jax.motion.roughness import check_jumps, spikes
+from forgetmimic_jax.motion.variants import with_variant
 from forgetmimic_jax.robot.model import Robot
 
 READERS: dict[str, Callable[[Robot, Path], Recording]] = {
@@ -56,10 +57,11 @@ def read_motion(robot: Robot, path: Path, reading: Reading | None = None) -> Rea
     if frames < 2 or frames / rate < MIN_SECONDS:
         seconds = f"{frames} frame(s) at {rate:g} Hz: {frames / rate:.2f} s"
         raise InputError(f"{path}: {seconds}; at least {MIN_SECONDS} s are needed")
+    reading, variant = with_variant(robot, recording, reading, rate, path, first)
     if recording.joint_names is None and not recording.order_is_given and reading.joint_order == "auto":
         reading = _order_by_bodies(robot, recording, reading, rate, path)
     clip, changes = converted(robot, recording, reading, rate, path, first)
-    notes = [*recording.notes, *changes]
+    notes = [*recording.notes, *variant, *changes]
     compared = check_bodies(robot, recording, reading, clip, path)
     if compared:
         notes.append(compared)

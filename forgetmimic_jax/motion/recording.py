@@ -32,6 +32,7 @@ class Reading:
     unit: Unit = "m"  # of positions
     angles: Angles = "radians"  # of joints
     fill_missing: bool = False  # joints that the file lacks keep their default angle
+    variant: str | None = None  # of the robot, with fewer joints: its name in the robot's YAML
     start: float = 0.0  # first second to take
     end: float | None = None  # last second to take; the file's end by default
 
