@@ -20,8 +20,8 @@ from forgetmimic_jax.motion.plausible import LIMIT, beyond_ranges
 from forgetmimic_jax.motion.recording import Reading, Recording
 from forgetmimic_jax.robot.model import Robot
 
-# A joint that is off its range in a twentieth of the frames. Of 17 real clips the right variant gives 0.00; the wrong
-# one 0.15 to 2.5 in half of them, and as little as the right one in the others, which are then refused.
+# A joint that is off its range in a twentieth of the frames. Of 17 real clips of the G1 the right variant gives 0.00
+# rad; the wrong one more than LIMIT in 14 where the file lacks waist joints, and in 5 where it lacks the wrists.
 OFTEN = 0.95
 WITHIN = 0.2 * LIMIT  # rad
 
