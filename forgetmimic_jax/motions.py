@@ -30,7 +30,7 @@ class Import:
     """The .csv, .npz or .pkl. A CSV without names: root position m, quaternion xyzw, joints rad in the robot's
     order."""
     name: str | None = None
-    """Name of the clip; the file's by default."""
+    """Name of the clip; the file's by default, with _ for every other character than letters, digits, - and _."""
     fps: float | None = None
     """Frames per second of the file. A CSV needs it (LAFAN1 retargets: 30); the other formats hold it."""
     start: float = 0.0
@@ -52,6 +52,8 @@ class Import:
     """Unit of the file's joint angles."""
     fill_missing: bool = False
     """Hold joints that the file lacks at their default angle."""
+    variant: str | None = None
+    """Variant of the robot that the file holds, where several have as many joints. With --fill-missing."""
     keep_height: bool = False
     """Leave the heights as they are. Otherwise the soles are set on the ground, at most 0.3 m away."""
     licence: str = "unknown"
@@ -151,10 +153,11 @@ def main(options: Options) -> None:
 def import_motion(robot: Robot, options: Import) -> None:
     """Make a clip of a motion file and add it to a library."""
     from forgetmimic_jax.motion import importing, library
+    from forgetmimic_jax.motion.clip import default_name
     from forgetmimic_jax.motion.recording import Reading
     from forgetmimic_jax.motion.table import quality_table
 
-    folder, name = options.library or Path("runs") / f"library-{robot.name}", options.name or options.file.stem
+    folder, name = options.library or Path("runs") / f"library-{robot.name}", options.name or default_name(options.file)
     library.manifest_for(folder, robot, name, importing.FPS, overwrite=options.force)
     reading = Reading(**{field.name: getattr(options, field.name) for field in fields(Reading)})
     imported = importing.import_motion(robot, options.file, reading, keep_height=options.keep_height)

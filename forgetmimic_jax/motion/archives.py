@@ -82,7 +82,11 @@ def read_fields(path: Path) -> dict[str, Any]:
 
 
 def _names(content: dict[str, Any], field: str) -> tuple[str, ...] | None:
-    return tuple(map(str, np.asarray(content[field]).reshape(-1))) if field in content else None
+    """The names in a field; some files hold them as bytes."""
+    if field not in content:
+        return None
+    names = np.asarray(content[field]).reshape(-1)
+    return tuple(name.decode("utf-8", "replace") if isinstance(name, bytes) else str(name) for name in names)
 
 
 def _of_qpos(content: dict[str, Any], path: Path) -> Recording:

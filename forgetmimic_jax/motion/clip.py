@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,6 +39,11 @@ class Clip:
     def seconds(self) -> float:
         """Duration in s: a frame stands for one control step."""
         return self.num_frames / self.fps
+
+
+def default_name(file: Path) -> str:
+    """A clip's name from its file's: other characters than letters, digits, - and _ become _."""
+    return re.sub(r"[^A-Za-z0-9_-]+", "_", file.stem).strip("_-") or "clip"
 
 
 def validated(clip: Clip, source: str, first: int = 0) -> Clip:

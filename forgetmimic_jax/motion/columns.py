@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,6 +20,9 @@ POSITION = re.compile(ROOT + r"(?:position|pos|translation|translate|trans|t|p)?
 QUATERNION = re.compile(ROOT + r"(?:quaternion|quat|orientation|rotation|rot|q)[_. ]?([xyzw])|r([xyzw])")
 EULER = re.compile(ROOT + r"(?:rotate|rotation|rot|euler|r)[_. ]?([xyz])|(?:root_)?(roll|pitch|yaw)")
 CLOCK = re.compile(r"(time|timestamp|t|seconds?|sec)([_. ]?\(?s\)?)?")
+VELOCITY = re.compile(r"_(vel|velocity)([_. (].*)?$")
+JOINT = re.compile(r"_(joint|dof)(_pos|_position|_angle|_rad|_deg)*$|^(j|q|dof|joint)_?\d+$")
+FINGER = re.compile(r"hand|finger|thumb")
 COUNTER = re.compile(r"(frames?|index|idx|step|no|nr|id|n)?([_. ]?(id|no|nr|number|index|idx))?")
 
 
@@ -32,7 +36,7 @@ def read_csv(robot: Robot, path: Path) -> Recording:
     names = [name.lower() for name in table.names or ()]
     joints = named_joints(robot, table.names or ())
     if joints:
-        return _by_name(names, joints, table.values, path)
+        return _by_name(robot, names, joints, table.values, path)
     recording = _by_place(robot, table.values, path)
     if not names:
         return recording
@@ -51,10 +55,33 @@ def named_joints(robot: Robot, names: Sequence[str]) -> dict[int, str]:
     return {place: known[plain(name)] for place, name in enumerate(names) if plain(name) in known}
 
 
-def _by_name(names: list[str], joints: dict[int, str], values: np.ndarray, path: Path) -> Recording:
+def _velocities(robot: Robot, names: Sequence[str]) -> dict[int, str]:
+    """The robot's joint whose velocity each column is, by the column's place."""
+    return named_joints(robot, [VELOCITY.sub("", name) if VELOCITY.search(name) else "" for name in names])
+
+
+def _beside(joints: dict[int, str], velocities: dict[int, str], values: np.ndarray) -> np.ndarray | None:
+    """Velocities [frame, joint] of the joints; NaN where the file has none, and None where it has none at all."""
+    if not velocities:
+        return None
+    place = {joint: column for column, joint in velocities.items()}
+    none = np.full(len(values), np.nan)
+    return np.stack([values[:, place[joint]] if joint in place else none for joint in joints.values()], axis=-1)
+
+
+def _is_other_joint(robot: Robot, name: str) -> bool:
+    """Whether a column is a joint that the robot lacks: no finger, and no further quantity of one of its joints."""
+    known = [plain(joint) for joint in robot.joint_names]
+    if FINGER.search(name) or any(name.startswith(joint) for joint in known):
+        return False
+    return bool(JOINT.search(name) or difflib.get_close_matches(plain(name), known, n=1, cutoff=0.7))
+
+
+def _by_name(robot: Robot, names: list[str], joints: dict[int, str], values: np.ndarray, path: Path) -> Recording:
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise InputError(f"{path}: line 1: two columns are called {', '.join(twice)}; a name a column is needed")
+    velocities = _velocities(robot, names)
     others = {place: name for place, name in enumerate(names) if place not in joints}
     position = {m[1]: place for place, name in others.items() if (m := POSITION.fullmatch(name))}
     quaternion = {m[1] or m[2]: place for place, name in others.items() if (m := QUATERNION.fullmatch(name))}
@@ -69,15 +96,17 @@ def _by_name(names: list[str], joints: dict[int, str], values: np.ndarray, path:
             f"{path}: line 1: the root's columns are not found among {', '.join(others.values()) or 'no names'}; "
             "needed: x, y, z, qx, qy, qz, qw"
         )
-    rate, spare = None, []
+    rate, field, clock, spare = None, "fps", None, []
     for place, name in others.items():
         if place in used:
             continue
         if CLOCK.fullmatch(name):
-            rate = _rate_of_clock(values[:, place])
-        elif not COUNTER.fullmatch(name):
+            if (told := _rate_of_clock(values[:, place])) is not None:
+                rate, field, clock = told, f"column {name}", values[:, place]
+        elif place not in velocities and not COUNTER.fullmatch(name):
             spare.append(name)
     notes = ["columns taken by the names of the header"]
+    notes += ["joint velocities stand beside the positions"] if velocities else []
     if spare:
         notes.append(f"columns that are no joint of the robot's are left out: {', '.join(spare)}")
     return Recording(
@@ -86,16 +115,21 @@ def _by_name(names: list[str], joints: dict[int, str], values: np.ndarray, path:
         root_pos=root_pos,
         root_quat=root_quat,
         quaternion=order,
+        other_joints=tuple(name for name in spare if _is_other_joint(robot, name)),
         fps=rate,
+        fps_field=field,
+        clock=clock,
+        joint_vel=_beside(joints, velocities, values),
         notes=tuple(notes),
     )
 
 
 def _by_place(robot: Robot, values: np.ndarray, path: Path) -> Recording:
-    rate, notes = None, []
-    widths = {7 + count for count in (robot.num_joints, *robot.variants)}
+    rate, clock, notes = None, None, []
+    widths = {7 + robot.num_joints - lacking for lacking in (0, *map(len, robot.variants.values()))}
     if values.shape[1] - 1 in widths and _is_steady(values[:, 0]):
         rate = _rate_of_clock(values[:, 0])
+        clock = values[:, 0] if rate is not None else None
         notes.append(f"the first column is a {'counter' if rate is None else 'clock'}: left out")
         values = values[:, 1:]
     if values.shape[1] not in widths:
@@ -109,6 +143,8 @@ def _by_place(robot: Robot, values: np.ndarray, path: Path) -> Recording:
         root_quat=values[:, 3:7],
         quaternion="xyzw",
         fps=rate,
+        fps_field="fps" if clock is None else "first column, a clock",
+        clock=clock,
         notes=tuple(notes),
     )
 
@@ -120,6 +156,10 @@ def _is_steady(column: np.ndarray) -> bool:
 
 
 def _rate_of_clock(column: np.ndarray) -> float | None:
-    """Frames per s of a column of seconds; None for a counter."""
-    step = float(np.median(np.diff(column))) if len(column) > 1 else 0.0
-    return None if step <= 0.0 or step == round(step) else round(1.0 / step, 3)
+    """Frames per s of a column of seconds; None for a counter, or for a clock that counts in another unit."""
+    steps = np.diff(column)
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    if not 0.0 < usual < 1.0:
+        return None
+    kept = steps[(steps >= 0.0) & (steps <= 2.0 * usual)]  # a gap is no step; clocks of few decimals step unevenly
+    return round(1.0 / float(np.mean(kept)), 3)

@@ -83,12 +83,16 @@ def _in_robot_order(
     given = [known.get(plain(name), name) for name in names]
     missing = [joint for joint in robot.joint_names if joint not in given]
     unknown = [name for name in given if name not in robot.joint_names]
-    if unknown or len(set(given)) != len(given) or (missing and not reading.fill_missing):
+    unknown += recording.other_joints if missing else ()  # another robot's file
+    twice = sorted({name for name in given if given.count(name) > 1})
+    if unknown or twice or (missing and not reading.fill_missing):
         hint = f"; {nearest(unknown[0], missing)}" if unknown and missing else ""
-        fill = "" if unknown else "; --fill-missing holds them at their default angle"
+        named = f"; twice: {', '.join(twice)}" if twice else ""
+        fill = "" if unknown or twice else "; --fill-missing holds them at their default angle"
         raise InputError(
             f"{path}: joint_names: not {robot.name}'s {robot.num_joints} joints, each once (missing: "
-            f"{', '.join(missing) or 'none'}; unknown: {', '.join(unknown) or 'none'}){hint}{fill if missing else ''}"
+            f"{', '.join(missing) or 'none'}; unknown: {', '.join(unknown) or 'none'}{named}){hint}"
+            f"{fill if missing else ''}"
         )
     columns = np.tile(np.asarray(robot.arrays.default_joint_pos, np.float64), (len(joint_pos), 1))
     columns[:, [robot.joint_names.index(joint) for joint in given]] = joint_pos
@@ -99,15 +103,22 @@ def _unnamed(robot: Robot, reading: Reading, count: int, path: Path) -> tuple[st
     """The names of columns that the file does not name."""
     if count == robot.num_joints:
         return breadth_first(robot) if reading.joint_order == "isaac" else robot.joint_names
-    if count not in robot.variants or reading.joint_order == "isaac":
+    candidates = variants_of(robot, count)
+    if not candidates or reading.joint_order == "isaac":
         raise InputError(f"{path}: found {count} joints; {robot.num_joints} of {robot.name} are needed")
-    lacking = robot.variants[count]
     if not reading.fill_missing:
+        looks = ", or ".join(f"{name} without {', '.join(lacking)}" for name, lacking in candidates.items())
         raise InputError(
             f"{path}: found {count} joints; {robot.num_joints} of {robot.name} are needed. It looks like the variant "
-            f"without {', '.join(lacking)}; --fill-missing holds these at their default angle"
+            f"{looks}; --fill-missing holds these at their default angle"
         )
+    lacking = candidates[reading.variant or next(iter(candidates))]
     return tuple(joint for joint in robot.joint_names if joint not in lacking)
+
+
+def variants_of(robot: Robot, count: int) -> dict[str, tuple[str, ...]]:
+    """The joints that each variant of the robot with so many joints lacks, by the variant's name."""
+    return {str(name): lacking for name, lacking in robot.variants.items() if robot.num_joints - len(lacking) == count}
 
 
 def _without_turns(robot: Robot, joint_pos: np.ndarray) -> tuple[np.ndarray, list[str]]:

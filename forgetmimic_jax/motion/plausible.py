@@ -95,7 +95,6 @@ def doubt_of(robot: Robot, clip: Clip) -> Doubt:
     qpos = configuration(clip, robot)
     points = floor_points(robot)
     now, after = (floor_positions(robot, points, qpos[rows]) for rows in (first, first + apart))
-    beyond = np.maximum(qpos[first, 7:] - robot.joint_upper, robot.joint_lower - qpos[first, 7:]).max(axis=1)
     lowest = now[..., 2].min(axis=1)
     level = float(np.quantile(lowest, 0.2))
     speed = np.linalg.norm(after[..., :2] - now[..., :2], axis=-1) * clip.fps / apart
@@ -103,12 +102,18 @@ def doubt_of(robot: Robot, clip: Clip) -> Doubt:
     slowest = np.where(carries, speed, np.inf).min(axis=1)
     stands = (lowest < level + GROUND) & np.isfinite(slowest)
     return Doubt(
-        limit=float(np.median(np.maximum(beyond, 0.0))),
+        limit=float(np.median(beyond_ranges(robot, qpos[first, 7:]))),
         level=level,
         wander=float(np.median(np.abs(lowest - np.median(lowest)))),
         slide=float(np.median(slowest[stands])) if stands.any() else np.inf,
         travel=float(np.median(np.linalg.norm(np.diff(clip.root_pos[:, :2], axis=0), axis=1))) * clip.fps,
     )
+
+
+def beyond_ranges(robot: Robot, joint_pos: np.ndarray) -> np.ndarray:
+    """[frame] rad, of the joint that is furthest beyond its range; 0 where every joint is inside."""
+    beyond = np.maximum(joint_pos - robot.joint_upper, robot.joint_lower - joint_pos).max(axis=1)
+    return np.maximum(beyond, 0.0)
 
 
 def check_plausible(robot: Robot, recording: Recording, reading: Reading, clip: Clip, path: Path) -> list[str]:
@@ -120,7 +125,7 @@ def check_plausible(robot: Robot, recording: Recording, reading: Reading, clip: 
     here = doubt_of(robot, clip)
     if here.size < NOTICED:
         return []
-    for candidates in (_other_readings(recording, reading, 1), _other_readings(recording, reading, 2)):
+    for candidates in (other_readings(recording, reading, 1), other_readings(recording, reading, 2)):
         tried = [(_doubt(robot, recording, other, clip.fps, path), flags) for other, flags in candidates]
         best, flags = min(tried, default=(np.inf, ""))
         if best < min(BETTER * here.size, GOOD):
@@ -143,7 +148,7 @@ def check_plausible(robot: Robot, recording: Recording, reading: Reading, clip: 
     return []
 
 
-def _other_readings(recording: Recording, reading: Reading, changes: int) -> Iterator[tuple[Reading, str]]:
+def other_readings(recording: Recording, reading: Reading, changes: int) -> Iterator[tuple[Reading, str]]:
     """Every reading that differs in some fields, and the flags that ask for it."""
     used: dict[str, Any] = {**vars(reading), "quaternion": reading.quaternion.replace("auto", recording.quaternion)}
     used["joint_order"] = used["joint_order"].replace("auto", "robot")

@@ -13,14 +13,15 @@ from typing import Literal
 
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.motion.archives import read_npz
-from forgetmimic_jax.motion.clip import Clip
+from forgetmimic_jax.motion.clip import Clip, default_name
 from forgetmimic_jax.motion.columns import read_csv
-from forgetmimic_jax.motion.comparing import check_bodies, check_rate
+from forgetmimic_jax.motion.comparing import BODY_DISTANCE, check_bodies, check_clock, check_rate, distances
 from forgetmimic_jax.motion.converting import converted
 from forgetmimic_jax.motion.pickles import read_pickle
 from forgetmimic_jax.motion.plausible import check_plausible
-from forgetmimic_jax.motion.recording import Reading, Recording, trimmed
+from forgetmimic_jax.motion.recording import MIN_SECONDS, Reading, Recording, trimmed
 from forgetmimic_jax.motion.roughness import check_jumps, spikes
+from forgetmimic_jax.motion.variants import with_variant
 from forgetmimic_jax.robot.model import Robot
 
 READERS: dict[str, Callable[[Robot, Path], Recording]] = {
@@ -31,7 +32,6 @@ READERS: dict[str, Callable[[Robot, Path], Recording]] = {
     ".pickle": read_pickle,
 }
 LFS = b"version https://git-lfs"
-MIN_SECONDS = 0.5
 RATES = (5.0, 1000.0)  # Hz
 
 
@@ -57,20 +57,22 @@ def read_motion(robot: Robot, path: Path, reading: Reading | None = None) -> Rea
     if frames < 2 or frames / rate < MIN_SECONDS:
         seconds = f"{frames} frame(s) at {rate:g} Hz: {frames / rate:.2f} s"
         raise InputError(f"{path}: {seconds}; at least {MIN_SECONDS} s are needed")
+    reading, variant = with_variant(robot, recording, reading, rate, path, first)
     if recording.joint_names is None and not recording.order_is_given and reading.joint_order == "auto":
         reading = _order_by_bodies(robot, recording, reading, rate, path)
     clip, changes = converted(robot, recording, reading, rate, path, first)
-    notes = [*recording.notes, *changes]
+    notes = [*recording.notes, *variant, *changes]
     compared = check_bodies(robot, recording, reading, clip, path)
     if compared:
         notes.append(compared)
     elif recording.joint_names is None:
         notes.append(f"joint order: unchecked, taken for {_order_name(robot, reading)} (the file names no joints)")
     notes.append(check_rate(recording, clip, path))
+    notes += check_clock(recording, clip, first)
     notes += check_plausible(robot, recording, reading, clip, path)
     check_jumps(clip, first, path)
     notes += spikes(robot, clip, first)
-    return Read(dataclasses.replace(clip, name=reading.name or path.stem), tuple(notes))
+    return Read(dataclasses.replace(clip, name=reading.name or default_name(path)), tuple(notes))
 
 
 def _recording(robot: Robot, path: Path) -> Recording:
@@ -97,21 +99,19 @@ def _rate(recording: Recording, reading: Reading, path: Path) -> float:
 
 def _order_by_bodies(robot: Robot, recording: Recording, reading: Reading, rate: float, path: Path) -> Reading:
     """The reading whose joint order the file's bodies show; InputError where none or another than the robot's fits."""
-    fits: dict[str, str | InputError | None] = {}
-    orders: tuple[Literal["robot"], Literal["isaac"]] = ("robot", "isaac")
-    for order in orders:
-        attempt = dataclasses.replace(reading, joint_order=order)
+    orders: tuple[Literal["robot", "isaac"], ...] = ("robot", "isaac")
+    readings = {order: dataclasses.replace(reading, joint_order=order) for order in orders}
+    fits: dict[str, bool] = {}
+    for order, attempt in readings.items():
+        if order == "isaac" and recording.joint_pos.shape[1] != robot.num_joints:
+            continue  # of a variant, Isaac Lab's order is not known
         clip, _ = converted(robot, recording, attempt, rate, path)
-        try:
-            fits[order] = check_bodies(robot, recording, attempt, clip, path)
-        except InputError as error:
-            fits[order] = error
-    if isinstance(fits["robot"], str):
-        return dataclasses.replace(reading, joint_order="robot")
-    if isinstance(fits["isaac"], str):
+        found = distances(robot, recording, attempt, clip)
+        fits |= {order: max(found.values()) <= BODY_DISTANCE} if found else {}
+    if fits.get("isaac") and not fits.get("robot"):
         raise InputError(f"{path}: joint_names are missing; the bodies fit Isaac Lab's order: --joint-order isaac")
-    if isinstance(fits["robot"], InputError):
-        raise fits["robot"]
+    if "robot" in fits:
+        return readings["robot"]  # where it does not fit, `check_bodies` says so
     raise InputError(
         f"{path}: joint_names are missing, and there are no bodies to compare with, so the order is unknown; "
         f"give --joint-order robot if it is {robot.name}'s own, --joint-order isaac for Isaac Lab's"

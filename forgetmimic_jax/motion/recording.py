@@ -11,6 +11,8 @@ import numpy as np
 
 from forgetmimic_jax.basics.errors import InputError
 
+MIN_SECONDS = 0.5  # of a clip
+
 JointOrder = Literal["auto", "robot", "isaac"]
 QuaternionOrder = Literal["auto", "xyzw", "wxyz"]
 Up = Literal["z", "y"]
@@ -30,6 +32,7 @@ class Reading:
     unit: Unit = "m"  # of positions
     angles: Angles = "radians"  # of joints
     fill_missing: bool = False  # joints that the file lacks keep their default angle
+    variant: str | None = None  # of the robot, with fewer joints: its name in the robot's YAML
     start: float = 0.0  # first second to take
     end: float | None = None  # last second to take; the file's end by default
 
@@ -44,7 +47,10 @@ class Recording:
     quaternion: Literal["xyzw", "wxyz"]  # the order that the format has
     joint_names: tuple[str, ...] | None = None  # of the columns of joint_pos
     order_is_given: bool = True  # the format has the robot's order where it names no joints
+    other_joints: tuple[str, ...] = ()  # that the file has besides and the robot lacks
     fps: float | None = None
+    fps_field: str = "fps"  # what of the file says its rate
+    clock: np.ndarray | None = None  # [frame] s
     joint_vel: np.ndarray | None = None  # [frame, column]
     body_names: tuple[str, ...] | None = None
     body_pos: np.ndarray | None = None  # [frame, body, 3]

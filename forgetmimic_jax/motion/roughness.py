@@ -10,6 +10,7 @@ from scipy.ndimage import median_filter
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.motion.clip import Clip
 from forgetmimic_jax.motion.kinematics import rotation
+from forgetmimic_jax.motion.recording import MIN_SECONDS
 from forgetmimic_jax.robot.model import Robot
 
 # A jump is a step of the root that differs from the median of the steps around it. Over 26 real clips the largest
@@ -66,11 +67,13 @@ def spikes(robot: Robot, clip: Clip, first: int) -> list[str]:
     lines = []
     for joint in found[:SHOWN]:
         frames = np.flatnonzero(off[:, joint] > SPIKE)
-        start, end = first + frames[0] - 1, first + frames[0] + window
+        start, end = max(frames[0] - 1, 0), frames[0] + window  # the last good frame before, the first after
+        parts = [f"--end {_down((first + start) / clip.fps)}"] if start / clip.fps >= MIN_SECONDS else []
+        if (clip.num_frames - 1 - end) / clip.fps >= MIN_SECONDS:
+            parts.append(f"--start {_up((first + end) / clip.fps)}")
         lines.append(
             f"{robot.joint_names[joint]} jumps by {worst[joint]:.2f} rad and back at frame {first + frames[0]} "
-            f"({(first + frames[0]) / clip.fps:.2f} s); leave it out with --end {_down(start / clip.fps)} or "
-            f"--start {_up(end / clip.fps)}"
+            f"({(first + frames[0]) / clip.fps:.2f} s){'; leave it out with ' if parts else ''}{' or '.join(parts)}"
         )
     return lines + ([f"{len(found) - SHOWN} more joints jump and come back"] if len(found) > SHOWN else [])
 

@@ -45,17 +45,20 @@ def read_table(path: Path) -> Table:
     names = tuple(first) if words > len(first) / 2 else None
     if names is not None:
         lines = lines[1:]
+    if not lines:
+        raise InputError(f"{path}: found a header and no row of numbers")
+    lines = [(number, line.replace('"', "")) for number, line in lines]
     rows = [line.strip(" \r") if separator != "\t" else line for _, line in lines]
-    if rows and separator and rows[0].endswith(separator):  # a separator after the last cell
+    if separator and rows[0].endswith(separator):  # a separator after the last cell
         rows = [row.removesuffix(separator) for row in rows]
         names = names[:-1] if names and not names[-1] else names
     if separator != ",":
         rows = [row.replace(",", ".") for row in rows]
     try:
-        values = np.loadtxt(rows, delimiter=separator, comments=None, ndmin=2) if rows else np.empty((0, 0))
+        values = np.loadtxt(rows, delimiter=separator, comments=None, ndmin=2)
     except ValueError:
         raise InputError(f"{path}: {_fault(rows, [number for number, _ in lines], separator)}") from None
-    if names is not None and len(values) and len(names) != values.shape[1]:
+    if names is not None and len(names) != values.shape[1]:
         raise InputError(f"{path}: line 1: {len(names)} names for {values.shape[1]} columns; one a column is needed")
     return Table(values, names)
 

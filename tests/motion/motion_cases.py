@@ -1,9 +1,11 @@
 """An invented motion for tests of files and folders."""
 
+import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from forgetmimic_jax.motion.clip import Clip
+from forgetmimic_jax.motion.kinematics import configuration
 
 
 def waving(robot, name, frames, yaw_rate=0.0, fps=50.0):
@@ -15,3 +17,13 @@ def waving(robot, name, frames, yaw_rate=0.0, fps=50.0):
     turns = Rotation.from_rotvec(yaw_rate * time[:, None] * [0.0, 0.0, 1.0])
     path = np.stack([0.3 * time, np.zeros(frames), np.full(frames, robot.default_height)], axis=-1)
     return Clip(name, fps, robot.joint_names, path, turns.as_quat(scalar_first=True), joints)
+
+
+def body_positions(robot, clip):
+    """Positions [frame, body, 3] in the world of every body of a clip."""
+    data, found = mujoco.MjData(robot.model), []
+    for qpos in configuration(clip, robot):
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(robot.model, data)
+        found.append(data.xpos[1:].copy())
+    return np.array(found)

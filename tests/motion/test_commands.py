@@ -93,6 +93,14 @@ def test_a_name_that_is_taken_is_told_before_the_file_is_read(run, motion_file):
     assert "already has a clip 'wave'" in run("import", motion_file, "--library", "mine")[2]
 
 
+def test_a_name_from_the_file_is_cleaned_and_one_that_is_given_is_not(run, motion_file):
+    file = motion_file.rename(motion_file.with_name("Wave 1.2 (slow).pkl"))
+    assert run("import", file, "--library", "mine")[0] == 0
+    assert (file.parent / "mine" / "Wave_1_2_slow.npz").is_file()
+    code, _, err = run("import", file, "--name", "Wave 1.2", "--library", "mine")
+    assert (code, "found 'Wave 1.2'; letters, digits" in err) == (2, True)
+
+
 def test_check_passes_the_shipped_library_and_draws_it(run, tmp_path):
     code, out, _ = run("--robot", "g1", "check", "--draw", "sheet.png")
     assert code == 0

@@ -73,6 +73,10 @@ def test_a_header_that_lacks_something(robot, clip, tmp_path):
     assert "--fill-missing" in text
     text = refusal(robot, table(tmp_path / "a.csv", rows, [*names[:-1], "x"]), fps=50.0)
     assert "two columns are called x" in text
+    text = refusal(robot, table(tmp_path / "a.csv", rows, [*names[:-1], "right_wrist_pitch_pos"]), fps=50.0)
+    assert "twice: right_wrist_pitch_joint" in text
+    (tmp_path / "a.csv").write_text(",".join(names) + "\n")
+    assert "a header and no row of numbers" in refusal(robot, tmp_path / "a.csv", fps=50.0)
     euler = ["x", "y", "z", "root_rotateX", "root_rotateY", "root_rotateZ", *robot.joint_names]
     assert "Euler angles" in refusal(robot, table(tmp_path / "a.csv", rows[:, 1:], euler), fps=50.0)
     kept = [name for name in names if name.removesuffix("_joint") not in LESS]
@@ -81,6 +85,29 @@ def test_a_header_that_lacks_something(robot, clip, tmp_path):
     waist = robot.joint_names.index("waist_roll_joint")
     np.testing.assert_allclose(filled.joint_pos[:, waist], 0.0)
     np.testing.assert_allclose(filled.joint_pos[:, 0], clip.joint_pos[:, 0], atol=1e-7)
+
+
+@pytest.mark.parametrize("other", ["torso_joint", "left_ankle", "left_wrist_ptich", "j28"])
+def test_another_robot_s_joint_is_refused_also_where_missing_joints_are_filled(robot, clip, tmp_path, other):
+    names = [*ROOT, *robot.joint_names[:-1], other]
+    path = table(tmp_path / "a.csv", clean_rows(clip), names)
+    assert f"unknown: {other}" in refusal(robot, path, fps=50.0, fill_missing=True)
+
+
+@pytest.mark.parametrize("other", ["battery", "left_knee_joint_torque", "left_hand_thumb_0_joint"])
+def test_columns_that_are_no_joint_of_the_body_are_left_out_where_missing_joints_are_filled(
+    robot, clip, tmp_path, other
+):
+    path = table(tmp_path / "a.csv", clean_rows(clip), [*ROOT, *robot.joint_names[:-1], other])
+    notes = read_motion(robot, path, Reading(fps=50.0, fill_missing=True)).notes
+    assert f"columns that are no joint of the robot's are left out: {other}" in notes
+
+
+def test_names_that_are_bytes(robot, clip, tmp_path):
+    names = np.array([joint.encode() for joint in robot.joint_names[::-1]])
+    fields = {"fps": 50, "root_pos": clip.root_pos, "root_quat": clip.root_quat, "joint_names": names}
+    np.savez(tmp_path / "a.npz", **fields, joint_pos=clip.joint_pos[:, ::-1])
+    assert_read(robot, tmp_path / "a.npz", clip)
 
 
 def test_a_counter_or_a_clock_without_a_name(robot, clip, tmp_path):
@@ -96,6 +123,8 @@ def test_a_counter_or_a_clock_without_a_name(robot, clip, tmp_path):
 @pytest.mark.parametrize(
     ("text", "names", "row"),
     [
+        ('"1.5","-2.5"\n', None, [1.5, -2.5]),
+        ('"a","b"\n"1.5","-2.5"\n', ("a", "b"), [1.5, -2.5]),
         ("1,2\n3,4\n", None, [1, 2]),
         ("# a,b\n1,2\n", ("a", "b"), [1, 2]),
         ('"a"; "b"\n1,5; -2,5e-1\n', ("a", "b"), [1.5, -0.25]),
@@ -189,6 +218,9 @@ def test_a_rate_in_the_file_s_name(robot, clip, tmp_path):
         ("walk 120 fps", 60.0, False),
         ("walk_2fpsx", 60.0, True),
         ("60hzx", 30.0, True),
+        ("walk_fps60", 30.0, False),
+        ("hz_60", 60.0, True),
+        ("walk_29.97fps", 30.0, True),
     ):
         path = tmp_path / f"{name}.csv"
         np.savetxt(path, clean_rows(clip), delimiter=",", fmt="%.9f")
