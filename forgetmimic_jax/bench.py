@@ -87,8 +87,8 @@ def main(options: Options) -> None:
         show(figures, f"{options.robot}, preset {options.preset}, {figures['engine']} engine")
     if options.output:
         options.output.parent.mkdir(parents=True, exist_ok=True)
-        figures["made"] = dataclasses.asdict(made_here())
-        write_atomically(options.output, (json.dumps(figures, indent=2) + "\n").encode())
+        document = {**figures, "made": dataclasses.asdict(made_here())}
+        write_atomically(options.output, (json.dumps(document, indent=2) + "\n").encode())
         print(f"figures  {options.output}")
 
 

@@ -118,7 +118,7 @@ def _unnamed(robot: Robot, reading: Reading, count: int, path: Path) -> tuple[st
 
 def variants_of(robot: Robot, count: int) -> dict[str, tuple[str, ...]]:
     """The joints that each variant of the robot with so many joints lacks, by the variant's name."""
-    return {str(name): lacking for name, lacking in robot.variants.items() if robot.num_joints - len(lacking) == count}
+    return {name: lacking for name, lacking in robot.variants.items() if robot.num_joints - len(lacking) == count}
 
 
 def _without_turns(robot: Robot, joint_pos: np.ndarray) -> tuple[np.ndarray, list[str]]:

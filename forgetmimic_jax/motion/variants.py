@@ -56,7 +56,7 @@ def _check_named(robot: Robot, recording: Recording, name: str, path: Path) -> N
     """Refuse a variant that the user names and the file cannot hold."""
     count = recording.joint_pos.shape[1]
     if name not in robot.variants:
-        known = ", ".join(map(str, robot.variants)) or f"none of {robot.name}"
+        known = ", ".join(robot.variants) or f"none of {robot.name}"
         raise InputError(f"{path}: --variant: found '{name}'; accepted: {known}")
     if recording.joint_names is not None:
         raise InputError(f"{path}: --variant: found '{name}', but the file names its joints; leave it out")

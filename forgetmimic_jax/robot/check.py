@@ -98,10 +98,10 @@ def _joints(roles: Mapping[str, Any], joints: list[str]) -> Iterator[str]:
     for pattern in roles.get("ignored_motors", ()):
         if not any(re.fullmatch(pattern, joint) for joint in joints):
             yield f"ignored_motors: no joint matches '{pattern}'"
-    for count, patterns in roles.get("variants", {}).items():
-        left = [joint for joint in joints if not any(re.fullmatch(pattern, joint) for pattern in patterns)]
-        if len(left) != count:
-            yield f"variants: {count}: {len(left)} joints match none of its patterns; {count} are needed"
+    for name, patterns in roles.get("variants", {}).items():
+        for pattern in patterns:
+            if not any(re.fullmatch(pattern, joint) for joint in joints):
+                yield f"variants: {name}: no joint matches '{pattern}'"
     if "joint_motors" not in roles:
         return
     if "motors" in roles:

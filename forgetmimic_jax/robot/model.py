@@ -61,7 +61,7 @@ class Robot:
     joint_upper: np.ndarray  # [joint] rad
     motor_counts: np.ndarray  # bool[joint]: the motor's load counts when a clip is judged
     counterpart: np.ndarray  # [joint] place of the other side's joint, or the joint's own
-    variants: Mapping[int, tuple[str, ...]]  # the joints that a variant of the robot lacks, by the number it has
+    variants: Mapping[str, tuple[str, ...]]  # the joints that a variant of the robot lacks, by its name
     default_height: float  # root height of the default pose, m
     key_bodies: tuple[str, ...]
     key_body_ids: np.ndarray  # [key_body] rows of the model's bodies
@@ -301,8 +301,8 @@ def _resolved(
         motor_counts=np.array([roles.counts_motor_of(joint) for joint in joint_names]),
         counterpart=np.array([counterpart_ids.get(joint, joint) - 1 for joint in range(1, model.njnt)]),
         variants={
-            count: tuple(joint for joint in joint_names if any(re.fullmatch(pattern, joint) for pattern in patterns))
-            for count, patterns in roles.variants.items()
+            name: tuple(joint for joint in joint_names if any(re.fullmatch(pattern, joint) for pattern in patterns))
+            for name, patterns in roles.variants.items()
         },
         default_height=roles.default_height,
         key_bodies=key_bodies,

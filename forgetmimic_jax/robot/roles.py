@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -51,7 +51,7 @@ class Roles:
     fixed: tuple[str, ...]
     ranges: Mapping[str, tuple[float, float]]
     spheres: tuple[tuple[str, float, float, float, float], ...]
-    variants: Mapping[Any, tuple[str, ...]]  # patterns of the joints that a variant lacks, by its name
+    variants: Mapping[str, tuple[str, ...]]  # patterns of the joints that a variant lacks, by its name
 
     @property
     def additions(self) -> Additions:
@@ -91,10 +91,7 @@ def read_roles(path: Path) -> Roles:
                 problems += [f"{name}: {line}" for line in wrong.args]
     if "model" in values:
         try:
-            model = _model(path.parent / values["model"], values)
-            variants = values.get("variants", {})
-            problems += misfits({name: value for name, value in values.items() if name != "variants"}, model)
-            problems += _unmatched(variants, [model.joint(joint).name for joint in range(1, model.njnt)])
+            problems += misfits(values, _model(path.parent / values["model"], values))
         except _Wrong as wrong:
             problems += [f"model: {line}" for line in wrong.args]
     if problems:
@@ -117,14 +114,6 @@ def _model(file: Path, values: Mapping[str, Any]) -> mujoco.MjModel:
         raise _Wrong(str(error)) from None
     except ValueError as error:
         raise _Wrong(f"{file.name}: {' '.join(str(error).split())}") from None
-
-
-def _unmatched(variants: Mapping[str, tuple[str, ...]], joints: list[str]) -> Iterator[str]:
-    """A line for every pattern of a variant that no joint matches."""
-    for name, patterns in variants.items():
-        for pattern in patterns:
-            if not any(re.fullmatch(pattern, joint) for joint in joints):
-                yield f"variants: {name}: no joint matches '{pattern}'"
 
 
 def _name(value: Any) -> str:
