@@ -15,7 +15,7 @@ step_dt                    s between two actions
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,6 +29,12 @@ from forgetmimic_jax.tracking.layouts import LAYOUTS, UNSUPPORTED
 
 Facts = dict[str, Any]
 TABLES = ("default_joint_pos", "action_offset", "action_scale", "joint_stiffness", "joint_damping")
+# Of the tables whose numbers cannot be any: what is accepted, and whether a number is.
+BOUNDS: dict[str, tuple[str, Callable[[float], bool]]] = {
+    "action_scale": ("more than 0", lambda value: value > 0.0),
+    "joint_stiffness": ("more than 0", lambda value: value > 0.0),
+    "joint_damping": ("0 or more", lambda value: value >= 0.0),
+}
 DEPLOY, CONFIG = "deploy.yaml", "config.yaml"
 # Isaac Lab's names of the same terms, in unitree_rl_lab and unitree_rl_mjlab.
 ISAAC_TERMS = {"motion_command": "command", "joint_pos_rel": "joint_pos", "joint_vel_rel": "joint_vel"}
@@ -98,7 +104,7 @@ def from_metadata(metadata: Mapping[str, str], robot: Robot, where: str) -> Fact
         joints = facts["joint_names"] = _joints(metadata["joint_names"].split(","), robot, f"{where}: joint_names")
     for key in TABLES:
         if key in metadata:
-            facts[key] = _table(metadata[key].split(","), joints, f"{where}: {key}")
+            facts[key] = _table(key, metadata[key].split(","), joints, f"{where}: {key}")
     if "step_dt" in metadata:
         facts["step_dt"] = _numbers([metadata["step_dt"]], 1, f"{where}: step_dt")[0]
     return facts
@@ -123,10 +129,11 @@ def from_deploy_yaml(content: Mapping[str, Any], robot: Robot, where: str) -> Fa
                              f"once: a policy of another robot?")  # fmt: skip
         joints = facts["joint_names"] = tuple(robot.joint_names[place] for place in places)
     if "default_joint_pos" in content:
-        facts["default_joint_pos"] = _table(content["default_joint_pos"], joints, f"{where}: default_joint_pos")
+        pose = content["default_joint_pos"]
+        facts["default_joint_pos"] = _table("default_joint_pos", pose, joints, f"{where}: default_joint_pos")
     for key in ("stiffness", "damping"):
         if key in content:
-            facts[f"joint_{key}"] = _table(content[key], robot.joint_names, f"{where}: {key}")
+            facts[f"joint_{key}"] = _table(f"joint_{key}", content[key], robot.joint_names, f"{where}: {key}")
     actions = content.get("actions") or {}
     if actions:
         if list(actions) != ["JointPositionAction"]:
@@ -136,7 +143,7 @@ def from_deploy_yaml(content: Mapping[str, Any], robot: Robot, where: str) -> Fa
         _check_unclipped(action.get("clip"), f"{field}.clip")
         for key in ("scale", "offset"):
             if action.get(key) is not None:
-                facts[f"action_{key}"] = _table(action[key], joints, f"{field}.{key}")
+                facts[f"action_{key}"] = _table(f"action_{key}", action[key], joints, f"{field}.{key}")
     if content.get("observations"):
         facts |= _terms(content["observations"], f"{where}: observations")
     if "step_dt" in content:
@@ -157,13 +164,13 @@ def from_config_yaml(content: Mapping[str, Any], robot: Robot, where: str) -> Fa
     for key in ("default_joint_pos", "stiffness", "damping"):
         if key in content:
             name = key if key in TABLES else f"joint_{key}"
-            facts[name] = _table(content[key], joints, f"{where}: {key}")
+            facts[name] = _table(name, content[key], joints, f"{where}: {key}")
     action, tracking = content.get("action") or {}, content.get("tracking") or {}
     if "action_mode" in action:
         facts["action_mode"] = _mode(action["action_mode"], f"{where}: action.action_mode")
     for key in ("scale", "offset"):
         if action.get(key) is not None:
-            facts[f"action_{key}"] = _table(action[key], joints, f"{where}: action.{key}")
+            facts[f"action_{key}"] = _table(f"action_{key}", action[key], joints, f"{where}: action.{key}")
     if content.get("actor_observations"):
         facts |= _terms(content["actor_observations"], f"{where}: actor_observations")
     if "anchor_body_name" in tracking:
@@ -217,12 +224,16 @@ def _some(names: Iterable[str]) -> str:
     return ", ".join(names[:3] + ["…"] * (len(names) > 3)) or "none"
 
 
-def _table(values: Any, joints: Sequence[str], where: str) -> dict[str, float]:
-    """Numbers by joint; one number stands for every joint."""
+def _table(key: str, values: Any, joints: Sequence[str], where: str) -> dict[str, float]:
+    """The table `key` of a number for each joint; one number stands for every joint."""
     values = values if isinstance(values, list) else [values]
-    return dict(
-        zip(joints, _numbers(values * (len(joints) if len(values) == 1 else 1), len(joints), where), strict=True)
-    )
+    values = values * len(joints) if len(values) == 1 else values
+    table = dict(zip(joints, _numbers(values, len(joints), where), strict=True))
+    accepted, is_possible = BOUNDS.get(key, ("", lambda value: True))
+    for joint, value in table.items():
+        if not is_possible(value):
+            raise InputError(f"{where}: {joint}: found {value:g}; accepted: {accepted}")
+    return table
 
 
 def _numbers(values: Any, count: int, where: str) -> list[float]:
