@@ -12,7 +12,7 @@ import numpy as np
 
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.exchange import clips, sources
-from forgetmimic_jax.exchange.description import Description, Row, agreed, describe
+from forgetmimic_jax.exchange.description import ASSUMED, Description, Row, agreed, describe
 from forgetmimic_jax.exchange.imported import ImportedActor, behind, check_actor
 from forgetmimic_jax.exchange.onnx_actor import OnnxActor
 from forgetmimic_jax.exchange.onnx_reader import OnnxContent, read_onnx
@@ -120,7 +120,7 @@ def _clip(
     if content and content.clip:
         joints = description.action.joint_order or robot.joint_names
         clip, file = clips.clip_inside(content.clip, joints, description.body_names, robot, path), path
-        bodies = "" if description.body_names else "; assumed: no body_names; the first body is the root"
+        bodies = "" if description.body_names else f"; {ASSUMED}no body_names; the first body is the root"
         source = f"inside the file, at 50 Hz{bodies}"
     elif motion:
         clip, file, source = clips.clip_beside(motion, reading.fps, robot), motion, f"{motion.name} beside the file"
