@@ -102,9 +102,9 @@ def main(options: Options) -> None:
     early = early_agreement(evaluation, record.rollout)
     if early < EARLY_SHARE:
         raise InputError(
-            f"{path}: in MuJoCo the ONNX's tracking reward equals the evaluation's in {early:.0%} of the episodes' first "
-            f"{EARLY_STEPS} steps; accepted: {EARLY_SHARE:.0%} or more; where episodes are few, a single contact may do "
-            f"that, and not with --episodes 10; nothing was written"
+            f"{path}: in MuJoCo the ONNX's tracking reward equals the evaluation's in {early:.0%} of the episodes' "
+            f"first {EARLY_STEPS} steps; accepted: {EARLY_SHARE:.0%} or more; where episodes are few, a single contact "
+            f"may do that, and not with --episodes 10; nothing was written"
         )
     output.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(output, content)
@@ -115,8 +115,8 @@ def main(options: Options) -> None:
     console = Console()
     console.print(_table(setup.library.names, evaluation, record.rollout))
     console.print(
-        f"{len(record.actions):,} actions equal the policy's to {error:.0e}; in {early:.0%} of the episodes' first {EARLY_STEPS} "
-        f"steps tracking equals the evaluation's to {EARLY_TOLERANCE:.0e}; rounding may grow at contacts.",
+        f"{len(record.actions):,} actions equal the policy's to {error:.0e}; in {early:.0%} of the episodes' first "
+        f"{EARLY_STEPS} steps tracking equals the evaluation's to {EARLY_TOLERANCE:.0e}; rounding grows at contacts.",
         highlight=False,
     )
     closing(

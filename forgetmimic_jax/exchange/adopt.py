@@ -115,7 +115,7 @@ def compared(foreign: ForeignPolicy, policy: Policy, trial: Trial) -> list[str]:
 
 
 def falls(foreign: ForeignPolicy, clips: Mapping[str, Tracked]) -> str | None:
-    """A sentence about the clips on which a policy falls, and about what was assumed of it; None if it falls on none."""
+    """A sentence about the clips that a policy falls on, and about what was assumed of it; None if it falls on none."""
     fallen = [f"{name} {of.survival:.0%}" for name, of in clips.items() if not of.survival >= LEAST_SURVIVAL]
     if not fallen:
         return None

@@ -104,11 +104,7 @@ def _described(path: Path, content: OnnxContent | None, robot: Robot, step_dt: f
     found = [("the flags", sources.from_flags(reading.layout, reading.mode, reading.order, robot))]
     if content and content.metadata:
         found.append(("the metadata", sources.from_metadata(content.metadata, robot, str(path))))
-    beside = sources.beside(path)
-    if beside:
-        kind, file, table = beside
-        read = sources.from_deploy_yaml if kind == sources.DEPLOY else sources.from_config_yaml
-        found.append((file.name, read(table, robot, str(file))))
+    found += sources.beside(path, robot)
     return describe(agreed(found, path), robot, step_dt, path)
 
 

@@ -257,6 +257,10 @@ def test_metadata_that_cannot_be_are_refused(robot, library, tmp_path, changes, 
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
+        ("joint_ids_map", [str(place) for place in range(29)], "joint_ids_map: found ['0', '1', '2', "),
+        ("actions", ["JointPositionAction"], "actions: found ['JointPositionAction']; a table is needed"),
+        ("actions.JointPositionAction", None, "actions.JointPositionAction: found None; a table is needed"),
+        ("observations.use_gym_history", True, "observations.use_gym_history: found True; accepted: false: its order"),
         ("joint_ids_map", list(range(23)), "joint_ids_map: found 23 places; the 29 joints of g1 are needed, each once"),
         ("stiffness", [1.0] * 28, "stiffness: found 28 numbers; 29 are needed"),
         ("actions", {"JointVelocityAction": {}}, "actions: found JointVelocityAction; accepted: JointPositionAction"),
@@ -333,6 +337,48 @@ def test_isaac_labs_order_can_be_given_where_nothing_says_it(robot, tmp_path):
     assert read(file, robot, layout="mjlab154", order="robot").description.action.joint_order == ()
     found = read(file, robot, layout="mjlab154", order="isaac").description.action.joint_order
     assert found == isaac_order(robot)
+
+
+def test_every_yaml_of_a_policy_is_read_and_two_that_disagree_are_named(robot, tmp_path):
+    file = wbc_folder(tmp_path, robot)
+    table = deploy_table(robot, "wbc132") | {"joint_ids_map": list(range(29))}
+    table |= {key: config_table(robot)[key] for key in ("default_joint_pos", "stiffness", "damping")} | {"actions": {}}
+    for folder in (tmp_path, tmp_path / "params"):
+        folder.mkdir(exist_ok=True)
+        (folder / "deploy.yaml").write_text(yaml.safe_dump(table, sort_keys=False))
+    assert sources(read(file, robot))["stiffness"] == f"joint_stiffness, {tmp_path / 'params' / 'deploy.yaml'}"
+    table["stiffness"] = [50.0] * 29
+    (tmp_path / "deploy.yaml").write_text(yaml.safe_dump(table, sort_keys=False))
+    (tmp_path / "params" / "deploy.yaml").unlink()
+    with pytest.raises(InputError, match=r"joint_stiffness: left_hip_pitch_joint: deploy.yaml says 50, config.yaml sa"):
+        read(file, robot)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("robot_id", "h1", "robot_id: found 'h1'; accepted: g1: a policy of another robot?"),
+        ("robot", "unitree_go2", "robot: found 'unitree_go2'; accepted: g1: a policy of another robot?"),
+        ("action", "x", "action: found x; a table is needed"),
+        ("tracking", ["x"], "tracking: found ['x']; a table is needed"),
+        ("action.action_mode", [1], "action.action_mode: found '[1]'; accepted: reference_residual, default_relative"),
+    ],
+)
+def test_a_config_yaml_that_cannot_be_is_refused(robot, tmp_path, key, value, message):
+    file = wbc_folder(tmp_path, robot, changed(config_table(robot), key, value))
+    with pytest.raises(InputError) as error:
+        read(file, robot)
+    assert str(error.value) == f"{tmp_path / 'config.yaml'}: {message}"
+
+
+def test_other_spellings_are_read(robot, library, tmp_path):
+    """Spaces after commas, longer names of the robot, and a history that is switched off."""
+    spaced = {key: value.replace(",", ", ") for key, value in metadata(robot, "mjlab160").items()}
+    path = mjlab_file(tmp_path / "a" / "kick.onnx", robot, library, **spaced)
+    assert values(read(path, robot)) == values(read(mjlab_file(tmp_path / "b" / "kick.onnx", robot, library), robot))
+    table = config_table(robot) | {"robot_id": "unitree_g1_29dof"}
+    table["actor_observations"]["use_gym_history"] = False
+    assert values(read(wbc_folder(tmp_path / "c", robot, table), robot))["layout"] == "wbc132"
 
 
 def test_another_projects_config_yaml_is_passed_over_and_humanoidverses_is_named(robot, library, tmp_path):
