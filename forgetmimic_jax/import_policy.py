@@ -91,7 +91,9 @@ def main(options: Options) -> None:
     references = read_reference(options.reference)
     robot = load_robot(options.robot)
     config = replace_given(preset(options.preset), robot=options.robot, library=options.library, seed=options.seed)
-    reading = Reading(activation=options.activation, fps=options.fps, start=options.start)
+    reading = Reading(
+        activation=options.activation, fps=options.fps, start=options.start, own_clip=options.library is None
+    )
     if len(options.files) == 1:
         reading = dataclasses.replace(
             reading, layout=options.layout, mode=options.action_mode, order=options.joint_order

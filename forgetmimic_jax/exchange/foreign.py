@@ -35,6 +35,7 @@ class Reading:
     activation: str | None = None  # of a .pt
     fps: float | None = None  # of a motion file beside a policy
     start: float = 0.0  # s, the first of the clip that is taken
+    own_clip: bool = True  # whether the clip inside the file or beside it is read
 
 
 @dataclass(frozen=True)
@@ -112,6 +113,8 @@ def _clip(
     path: Path, content: OnnxContent | None, description: Description, robot: Robot, reading: Reading
 ) -> tuple[Clip | None, Path | None, Row]:
     """The clip inside the file or beside it, where it is from, and the row that says so."""
+    if not reading.own_clip:
+        return None, None, Row("clip", "those of --library", "--library")
     motion = sources.motion_beside(path)
     if content and content.clip:
         joints = description.action.joint_order or robot.joint_names

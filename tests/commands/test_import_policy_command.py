@@ -144,6 +144,7 @@ def test_what_was_exported_comes_back_as_it_went(base_run, library_folder, robot
     file, output = tmp_path / "policy.onnx", tmp_path / "back"
     there = load_policy(base_run.checkpoint(4))
     onnx.save(to_onnx(there, robot, checkpoint.read_info(base_run.checkpoint(4)).config, run_path=""), file)
+    (tmp_path / "notes.csv").write_text("no,motion")  # which --library replaces
     message = finished(
         import_policy.main,
         import_policy.Options(files=(file,), library=library_folder, std=0.7, episodes=1, output=output),

@@ -172,6 +172,22 @@ def test_a_clip_in_another_order_of_joints_and_bodies_is_read_by_their_names(rob
     np.testing.assert_allclose(rebuilt.joint_pos, ours.joint_pos, atol=2e-5)
 
 
+@pytest.mark.parametrize("names", [{}, {"body_names": None}])
+def test_a_clip_inside_that_does_not_fit_its_own_bodies_is_refused(robot, library, tmp_path, names):
+    said = {key: value for key, value in (metadata(robot, "mjlab160") | names).items() if value is not None}
+    right = clip_tables(library)
+    assert read(network(tmp_path / "a.onnx", 160, metadata=said, tables=right), robot).clip is not None
+    others = {
+        "quaternions xyzw": right | {"body_quat_w": np.roll(right["body_quat_w"], -1, axis=-1)},
+        "orientations of other bodies": right | {"body_quat_w": right["body_quat_w"][:, [0, *range(13, 0, -1)]]},
+        "joints of the other side": right | {"joint_pos": right["joint_pos"][:, robot.counterpart]},
+    }
+    for what, tables in others.items():
+        path = network(tmp_path / f"{what}.onnx", 160, metadata=said, tables=tables)
+        with pytest.raises(InputError, match=rf"^{path}: the clip inside: forward kinematics: \w+ lies .* m from g1's"):
+            read(path, robot)
+
+
 def test_garbage_in_the_first_frames_is_named_and_can_be_left_out(robot, library, tmp_path):
     tables = clip_tables(library)
     tables["joint_pos"][0, 3] += 1.0  # the left knee moves 1 rad in 0.02 s, past 20 rad/s
@@ -183,6 +199,9 @@ def test_garbage_in_the_first_frames_is_named_and_can_be_left_out(robot, library
     left = read(file, robot, start=0.04)
     assert left.doubts == ()
     assert left.clip.num_frames == 78
+    for start in ("nan", "inf", "-0.1", "1.2"):
+        with pytest.raises(InputError, match=rf"^--start: found {start}; a has 1\.60 s, and half a second must remain"):
+            read(file, robot, start=float(start))
 
 
 def test_a_clip_beside_a_policy_is_taken_at_the_rate_in_its_name(robot, tmp_path):
@@ -198,6 +217,8 @@ def test_a_clip_beside_a_policy_is_taken_at_the_rate_in_its_name(robot, tmp_path
     with pytest.raises(InputError, match=r"take\.csv: fps: "):
         read(file, robot)
     assert read(file, robot, fps=50.0).clip.num_frames == 80
+    motion.with_name("take.csv").write_text("no,motion\n")
+    assert read(file, robot, own_clip=False).clip is None  # a file that is no motion stops nothing then
     (motion.parent / "other.csv").write_text("")  # two: which one is its clip is not said
     assert read(file, robot).clip is None
 
