@@ -142,6 +142,8 @@ def read_reference(path: Path | None) -> dict[str, dict[str, float]]:
         raise InputError(f"{path}: no such file") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: neither JSON nor YAML: {str(error).splitlines()[0]}") from None
+    if not content:
+        raise InputError(f"{path}: found {content!r}; accepted: a table of {', '.join(FIGURES)}")
     tables = (
         content if isinstance(content, dict) and all(isinstance(v, dict) for v in content.values()) else {"": content}
     )

@@ -125,6 +125,7 @@ def test_a_reference_must_be_met(with_clip, robot, library, tmp_path, refused):
     finished(import_policy.main, options)
     for content, message in (
         ("[", "neither JSON nor YAML: "),
+        ("{}", "found {}; accepted: a table of reward, joint_error, survival"),
         ("3", "found 3; accepted: a table of reward, joint_error, survival"),
         ("{speed: 1}", "speed: found 1; accepted: numbers of reward, joint_error, survival"),
     ):
