@@ -20,7 +20,9 @@ class Options:
 
     Beside it: deploy.yaml (unitree_rl_lab) for layout mjlab154, config.yaml (wbc-g1-deploy) for wbc132.
     Before the file is written it is run in plain MuJoCo on every clip: its actions must be the policy's to 1e-5, and
-    the robot must move as in the evaluation.
+    the robot must move as in the evaluation. For that, the tracking rewards of each episode's first 10 steps are
+    compared: 80 % of them must be the same to 1e-5. A wrong file differs from the first steps on and in every episode;
+    rounding that a contact makes large shows in one episode and from one step on.
     """
 
     robot: str = "g1"
@@ -38,7 +40,9 @@ class Options:
 
 
 ACTION_TOLERANCE = 1e-5  # of an action, or of 1 where the action is smaller
-EARLY_STEPS, EARLY_TOLERANCE = 10, 1e-4  # so long rounding has not grown, and tracking rewards must be the same
+# So long has rounding rarely grown: 1e-7 in files that are right, 1e-5 to 1e-3 where one wrist's scale is wrong by 5 %.
+EARLY_STEPS, EARLY_TOLERANCE = 10, 1e-5  # of a tracking reward
+EARLY_SHARE = 0.8  # of these steps
 
 
 def main(options: Options) -> None:
@@ -95,11 +99,12 @@ def main(options: Options) -> None:
     if not error <= ACTION_TOLERANCE:
         raise InputError(f"{path}: the ONNX's actions differ from the policy's by {error:.1e}; nothing was written")
     evaluation = evaluator.rollout(policy)
-    early = early_difference(evaluation, record.rollout)
-    if not early <= EARLY_TOLERANCE:
+    early = early_agreement(evaluation, record.rollout)
+    if early < EARLY_SHARE:
         raise InputError(
-            f"{path}: in MuJoCo the ONNX's tracking reward differs from the evaluation's by {early:.1e} within "
-            f"{EARLY_STEPS} steps; nothing was written"
+            f"{path}: in MuJoCo the ONNX's tracking reward equals the evaluation's in {early:.0%} of the episodes' "
+            f"first {EARLY_STEPS} steps; accepted: {EARLY_SHARE:.0%} or more; where episodes are few, a single contact "
+            f"may do that, and not with --episodes 10; nothing was written"
         )
     output.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(output, content)
@@ -110,8 +115,8 @@ def main(options: Options) -> None:
     console = Console()
     console.print(_table(setup.library.names, evaluation, record.rollout))
     console.print(
-        f"{len(record.actions):,} actions equal the policy's to {error:.0e}; over the first {EARLY_STEPS} steps "
-        f"tracking equals the evaluation's to {early:.0e}; later, rounding may grow at contacts.",
+        f"{len(record.actions):,} actions equal the policy's to {error:.0e}; in {early:.0%} of the episodes' first "
+        f"{EARLY_STEPS} steps tracking equals the evaluation's to {EARLY_TOLERANCE:.0e}; rounding grows at contacts.",
         highlight=False,
     )
     closing(
@@ -120,8 +125,8 @@ def main(options: Options) -> None:
     )
 
 
-def early_difference(one: Rollout, other: Rollout) -> float:
-    """Largest difference of tracking reward over the first steps that both policies survive."""
+def early_agreement(one: Rollout, other: Rollout) -> float:
+    """Share of the episodes' first steps, of those that both policies survive, in which tracking rewards are equal."""
     import numpy as np
 
     from forgetmimic_jax.evaluation.metrics import common_length, steps_before
@@ -129,7 +134,7 @@ def early_difference(one: Rollout, other: Rollout) -> float:
     steps = min(EARLY_STEPS, one.tracking_reward.shape[1])
     alive = steps_before(common_length([one, other]), steps)
     difference = np.abs(one.tracking_reward[:, :steps] - other.tracking_reward[:, :steps])
-    return float(difference[alive].max())
+    return float((difference[alive] <= EARLY_TOLERANCE).mean())
 
 
 def _table(names: Sequence[str], evaluation: Rollout, onnx: Rollout):

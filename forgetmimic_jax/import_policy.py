@@ -91,7 +91,9 @@ def main(options: Options) -> None:
     references = read_reference(options.reference)
     robot = load_robot(options.robot)
     config = replace_given(preset(options.preset), robot=options.robot, library=options.library, seed=options.seed)
-    reading = Reading(activation=options.activation, fps=options.fps, start=options.start)
+    reading = Reading(
+        activation=options.activation, fps=options.fps, start=options.start, own_clip=options.library is None
+    )
     if len(options.files) == 1:
         reading = dataclasses.replace(
             reading, layout=options.layout, mode=options.action_mode, order=options.joint_order
@@ -108,7 +110,8 @@ def main(options: Options) -> None:
 
 def _one(options: Options, foreign: ForeignPolicy, config: Config, references: References) -> Adopted:
     """A policy as it is; prints what was read of it and how it did."""
-    from forgetmimic_jax.exchange.adopt import adopt, check_reference
+    from forgetmimic_jax.basics.console import warn
+    from forgetmimic_jax.exchange.adopt import adopt, check_reference, falls
     from forgetmimic_jax.exchange.imported import notes
 
     made = adopt(foreign, config, std=options.std, episodes=options.episodes, seed=options.seed)
@@ -116,6 +119,8 @@ def _one(options: Options, foreign: ForeignPolicy, config: Config, references: R
     _say_read(foreign)
     _say_figures({"": made.trial.clips})
     _say("\n".join([*made.facts, *notes(foreign.actor, options.std)]))
+    if doubt := falls(foreign, made.trial.clips):
+        warn(doubt)
     return made
 
 
@@ -125,13 +130,16 @@ def _several(
     """One policy of several, by regression; prints what was read of them, and how they and the new one did."""
     from forgetmimic_jax.basics.console import progress
     from forgetmimic_jax.exchange import experts
-    from forgetmimic_jax.exchange.adopt import Adopted, adopt, check_reference, own_setup
+    from forgetmimic_jax.exchange.adopt import Adopted, adopt, check_reference, falls, own_setup
     from forgetmimic_jax.exchange.trial import try_out
     from forgetmimic_jax.training.checkpoint import Progress
 
     experts.check_clips(policies, options.library)
     wanted = experts.student_config(config, policies, robot, options.layout, options.action_mode)
     taught = [adopt(one, config, std=options.std, episodes=options.episodes, seed=options.seed) for one in policies]
+    for foreign, one in zip(policies, taught, strict=True):
+        if doubt := falls(foreign, one.trial.clips):
+            raise InputError(f"{doubt}; a policy that falls teaches nothing")
     known = {name: tracked for one in taught for name, tracked in one.trial.clips.items()}
     check_reference(options.reference, references, known)
     for foreign, one in zip(policies, taught, strict=True):

@@ -37,6 +37,7 @@ LIBRARY = "library"
 TOLERANCE = 1e-5  # of an action, or of 1 where the action is smaller
 COMPARED = 20_000  # observations at most at which actions are compared
 REFERENCE_TOLERANCE = 0.01  # of a reward, and rad
+LEAST_SURVIVAL = 0.5  # of a clip's episodes with reset noise: a policy that is read right reaches 0.95 and more
 FIGURES = ("reward", "joint_error", "survival")  # of `Tracked`, that a reference may have
 
 
@@ -113,6 +114,18 @@ def compared(foreign: ForeignPolicy, policy: Policy, trial: Trial) -> list[str]:
     return facts
 
 
+def falls(foreign: ForeignPolicy, clips: Mapping[str, Tracked]) -> str | None:
+    """A sentence about the clips that a policy falls on, and about what was assumed of it; None if it falls on none."""
+    fallen = [f"{name} {of.survival:.0%}" for name, of in clips.items() if not of.survival >= LEAST_SURVIVAL]
+    if not fallen:
+        return None
+    assumed = [f"{row.what} ({row.assumed})" for row in foreign.rows if row.assumed]
+    return (
+        f"{foreign.path}: the policy falls: survival: {', '.join(fallen)}; {LEAST_SURVIVAL:.0%} or more is expected of "
+        f"a policy on a clip that it knows; what was not read but assumed may be wrong: {', '.join(assumed)}"
+    )
+
+
 def read_reference(path: Path | None) -> dict[str, dict[str, float]]:
     """Figures that a roll-out must give, by clip; '' stands for every clip.
 
@@ -129,6 +142,8 @@ def read_reference(path: Path | None) -> dict[str, dict[str, float]]:
         raise InputError(f"{path}: no such file") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: neither JSON nor YAML: {str(error).splitlines()[0]}") from None
+    if not content:
+        raise InputError(f"{path}: found {content!r}; accepted: a table of {', '.join(FIGURES)}")
     tables = (
         content if isinstance(content, dict) and all(isinstance(v, dict) for v in content.values()) else {"": content}
     )

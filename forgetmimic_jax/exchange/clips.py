@@ -11,13 +11,15 @@ import numpy as np
 
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.motion.clip import Clip, validated
+from forgetmimic_jax.motion.comparing import BODY_DISTANCE
 from forgetmimic_jax.motion.importing import FPS, import_motion
-from forgetmimic_jax.motion.kinematics import configuration, tangent_steps
+from forgetmimic_jax.motion.kinematics import body_motion, configuration, tangent_steps
 from forgetmimic_jax.motion.recording import Reading
 from forgetmimic_jax.robot.model import Robot
 
 # A root of a clip is never so fast; what is faster is a jump between frames.
 ROOT_SPEED, ROOT_TURN = 5.0, 20.0  # m/s, rad/s
+BODY_TURN = 0.2  # rad, median over frames, between a body of a file and the robot's
 FIRST = 25  # frames at the start of a clip that may be garbage: half a second
 
 
@@ -43,7 +45,7 @@ def clip_inside(
         policy: the file.
 
     Raises:
-        InputError: no root, other shapes, or what is no motion.
+        InputError: no root, other shapes, what is no motion, or bodies that lie elsewhere than the robot's.
     """
     missing = [name for name in ("joint_pos", "body_pos_w", "body_quat_w") if name not in tables]
     if missing:
@@ -54,12 +56,53 @@ def clip_inside(
         raise InputError(
             f"{policy}: body_names: no '{root}', the root of {robot.name}; found {', '.join(bodies[:4])} …"
         )
-    if pos.ndim != 3 or angles.shape != (len(pos), len(joints)) or (bodies and pos.shape[1] != len(bodies)):
+    same = pos.ndim == 3 and quat.shape == (*pos.shape[:2], 4)
+    if not same or angles.shape != (len(pos), len(joints)) or (bodies and pos.shape[1] != len(bodies)):
         raise InputError(f"{policy}: the clip inside: found joint_pos {list(angles.shape)} and body_pos_w "
                          f"{list(pos.shape)}; {len(joints)} joints and {len(bodies) or 'some'} bodies are needed"
                          )  # fmt: skip
     body = list(bodies).index(root) if bodies else 0
-    return validated(Clip(clip_name(policy), FPS, tuple(joints), pos[:, body], quat[:, body], angles), str(policy))
+    clip = validated(Clip(clip_name(policy), FPS, tuple(joints), pos[:, body], quat[:, body], angles), str(policy))
+    _check_bodies(clip, pos, quat, bodies, robot, policy)
+    return clip
+
+
+def _check_bodies(
+    clip: Clip, pos: np.ndarray, quat: np.ndarray, bodies: Sequence[str], robot: Robot, policy: Path
+) -> None:
+    """InputError unless every body of a file lies and is turned as the robot's in the clip, by the median over frames.
+
+    A body is compared with the robot's of its name, or without names with the nearest. Other names are passed over.
+
+    Args:
+        clip: root and joints, from which forward kinematics follow.
+        pos: m [frame, body, 3] of the file.
+        quat: wxyz [frame, body, 4] of the file.
+        bodies: names; may be empty.
+        robot: compared with.
+        policy: the file.
+    """
+    ids = np.arange(1, robot.model.nbody)
+    names = [robot.model.body(body).name for body in ids]
+    found = body_motion(robot.model, configuration(clip, robot), clip.fps, ids)
+    wrong: list[tuple[float, float, str]] = []  # m, rad, body
+    for place in range(pos.shape[1]):
+        if bodies and bodies[place] not in names:
+            continue
+        distances = np.median(np.linalg.norm(found.pos - pos[:, place, None], axis=-1), axis=0)
+        ours = names.index(bodies[place]) if bodies else int(np.argmin(distances))
+        cosines = np.abs(np.sum(found.quat[:, ours] * quat[:, place], axis=-1))
+        distance, turn = float(distances[ours]), 2.0 * float(np.median(np.arccos(np.minimum(cosines, 1.0))))
+        if not (distance <= BODY_DISTANCE and turn <= BODY_TURN):
+            wrong.append((distance, turn, names[ours]))
+    if wrong:
+        distance, turn, body = max(wrong)
+        raise InputError(
+            f"{policy}: the clip inside: forward kinematics: {body} lies {distance:.2f} m from {robot.name}'s and is "
+            f"turned by {turn:.1f} rad (median over frames, worst of {pos.shape[1]} bodies); accepted: "
+            f"{BODY_DISTANCE:g} m and {BODY_TURN:g} rad: quaternions not wxyz, another order of joints or bodies, or "
+            f"another robot?"
+        )
 
 
 def clip_beside(motion: Path, fps: float | None, robot: Robot) -> Clip:
@@ -80,11 +123,11 @@ def from_second(clip: Clip, start: float) -> Clip:
     Raises:
         InputError: no half second is left.
     """
-    first = int(np.ceil(start * clip.fps - 1e-6))
-    if not 0 <= first <= clip.num_frames - 0.5 * clip.fps:
+    if not 0.0 <= start * clip.fps <= clip.num_frames - 0.5 * clip.fps:  # NaN compares as false
         raise InputError(
             f"--start: found {start:g}; {clip.name} has {clip.seconds:.2f} s, and half a second must remain"
         )
+    first = int(np.ceil(start * clip.fps - 1e-6))
     return dataclasses.replace(
         clip, root_pos=clip.root_pos[first:], root_quat=clip.root_quat[first:], joint_pos=clip.joint_pos[first:]
     )

@@ -18,6 +18,7 @@ from forgetmimic_jax.robot.model import Robot
 from forgetmimic_jax.settings.config import ActionConfig
 from forgetmimic_jax.tracking.layouts import LAYOUTS, Layout
 
+ASSUMED = "assumed: "
 ROUNDING = 2e-3  # projects write three digits, some of them two
 
 
@@ -27,6 +28,11 @@ class Row(NamedTuple):
     what: str
     value: str
     source: str  # the file and its key, or what was assumed since which key is missing
+
+    @property
+    def assumed(self) -> str | None:
+        """Why the value was assumed; None if it was read."""
+        return self.source.partition(ASSUMED)[2].partition(";")[0] or None
 
 
 class Fact(NamedTuple):
@@ -123,7 +129,7 @@ def describe(facts: Mapping[str, Fact], robot: Robot, step_dt: float, policy: Pa
     for name, key in {"default_pose": "default_joint_pos", **names}.items():
         own = "the robot's own" if tables[name] is None else "the action's offset"
         rows.append(_row(name.replace("_", " "), _compared(tables[name], robot, name), facts, key, own))
-    rows.append(Row("armature", "the robot's own", "assumed: no project's files say it"))
+    rows.append(Row("armature", "the robot's own", f"{ASSUMED}no project's files say it"))
     if offset and mode == "offset":
         rows.append(Row("action offset", _compared(offset, robot, "default_pose"), facts["action_offset"].source))
     given = {name: dict(table) for name, table in tables.items() if table}
@@ -138,7 +144,7 @@ def describe(facts: Mapping[str, Fact], robot: Robot, step_dt: float, policy: Pa
 def _row(what: str, value: str, facts: Mapping[str, Fact], key: str, assumed: str) -> Row:
     if key in facts:
         return Row(what, value, f"{key}, {facts[key].source}")
-    return Row(what, value, f"assumed: no {key}; {assumed}")
+    return Row(what, value, f"{ASSUMED}no {key}; {assumed}")
 
 
 def _layout(facts: Mapping[str, Fact], robot: Robot, policy: Path, rows: list[Row]) -> Layout:

@@ -7,6 +7,7 @@ order of joints, and its joint targets are put in the student's terms. The robot
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
@@ -194,6 +195,9 @@ def merge(
 
     Returns:
         The policy, and the control steps that it took.
+
+    Raises:
+        InputError: the regression's loss is not finite.
     """
     env = make_environment(student, ROBOTS, noisy=False)
     assets = make_assets(student)
@@ -208,7 +212,18 @@ def merge(
         for _ in range(config.rounds):
             state, metrics = one_round(assets, teaching, state)
             done, steps = done + 1, steps + ROBOTS * config.steps
-            report(done, steps, {name: float(value) for name, value in metrics.items()})
+            shown = {name: float(value) for name, value in metrics.items()}
+            _check_finite(shown, done)
+            report(done, steps, shown)
         if is_enough(state.student):
             break
     return state.student, steps
+
+
+def _check_finite(metrics: Mapping[str, float], done: int) -> None:
+    for name, value in metrics.items():
+        if not math.isfinite(value):
+            raise InputError(
+                f"regression on the policies: {name}: found {value} in round {done}; accepted: finite numbers; does "
+                f"each policy alone give sound figures (import-policy FILE)?"
+            )

@@ -12,7 +12,7 @@ import numpy as np
 
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.exchange import clips, sources
-from forgetmimic_jax.exchange.description import Description, Row, agreed, describe
+from forgetmimic_jax.exchange.description import ASSUMED, Description, Row, agreed, describe
 from forgetmimic_jax.exchange.imported import ImportedActor, behind, check_actor
 from forgetmimic_jax.exchange.onnx_actor import OnnxActor
 from forgetmimic_jax.exchange.onnx_reader import OnnxContent, read_onnx
@@ -35,6 +35,7 @@ class Reading:
     activation: str | None = None  # of a .pt
     fps: float | None = None  # of a motion file beside a policy
     start: float = 0.0  # s, the first of the clip that is taken
+    own_clip: bool = True  # whether the clip inside the file or beside it is read
 
 
 @dataclass(frozen=True)
@@ -104,11 +105,7 @@ def _described(path: Path, content: OnnxContent | None, robot: Robot, step_dt: f
     found = [("the flags", sources.from_flags(reading.layout, reading.mode, reading.order, robot))]
     if content and content.metadata:
         found.append(("the metadata", sources.from_metadata(content.metadata, robot, str(path))))
-    beside = sources.beside(path)
-    if beside:
-        kind, file, table = beside
-        read = sources.from_deploy_yaml if kind == sources.DEPLOY else sources.from_config_yaml
-        found.append((file.name, read(table, robot, str(file))))
+    found += sources.beside(path, robot)
     return describe(agreed(found, path), robot, step_dt, path)
 
 
@@ -116,11 +113,13 @@ def _clip(
     path: Path, content: OnnxContent | None, description: Description, robot: Robot, reading: Reading
 ) -> tuple[Clip | None, Path | None, Row]:
     """The clip inside the file or beside it, where it is from, and the row that says so."""
+    if not reading.own_clip:
+        return None, None, Row("clip", "those of --library", "--library")
     motion = sources.motion_beside(path)
     if content and content.clip:
         joints = description.action.joint_order or robot.joint_names
         clip, file = clips.clip_inside(content.clip, joints, description.body_names, robot, path), path
-        bodies = "" if description.body_names else "; assumed: no body_names; the first body is the root"
+        bodies = "" if description.body_names else f"; {ASSUMED}no body_names; the first body is the root"
         source = f"inside the file, at 50 Hz{bodies}"
     elif motion:
         clip, file, source = clips.clip_beside(motion, reading.fps, robot), motion, f"{motion.name} beside the file"

@@ -16,6 +16,7 @@ from onnx.reference import ReferenceEvaluator
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.exchange.imported import ImportedActor
 from forgetmimic_jax.exchange.onnx_actor import INPUT, OUTPUT
+from forgetmimic_jax.exchange.pointers import check_no_pointer
 from forgetmimic_jax.policy.normalizer import OBSERVATION_LIMIT
 from forgetmimic_jax.tracking.layouts import UNSUPPORTED
 
@@ -54,6 +55,9 @@ def read_onnx(path: Path) -> OnnxContent:
 
 
 def _load(path: Path) -> onnx.ModelProto:
+    check_no_pointer(path)
+    if path.is_file() and path.stat().st_size == 0:
+        raise InputError(f"{path}: an empty file; an ONNX model is needed")
     try:
         model = onnx.load(path, load_external_data=False)
     except FileNotFoundError:
@@ -70,6 +74,7 @@ def _load(path: Path) -> onnx.ModelProto:
     for name in sorted(weights):
         if not (path.parent / name).is_file():
             raise InputError(f"{path}: its weights are in {name}, and there is no such file beside it")
+        check_no_pointer(path.parent / name)
     try:
         load_external_data_for_model(model, str(path.parent))
     except (onnx.checker.ValidationError, ValueError, OSError) as error:

@@ -21,6 +21,7 @@ import yaml
 
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.exchange.imported import UNKNOWN_COUNT, ImportedActor
+from forgetmimic_jax.exchange.pointers import check_no_pointer
 from forgetmimic_jax.motion.unpickle import NumbersOnly, Refused
 
 EPSILON = 0.01  # of EmpiricalNormalization
@@ -49,6 +50,7 @@ def read_rsl_rl(path: Path, activation: str | None) -> ImportedActor:
     Raises:
         InputError: not such a checkpoint, a pickle that would run code, another network or activation.
     """
+    check_no_pointer(path)
     content = read_tensors(path)
     _check_activation(path, activation)
     try:
@@ -63,7 +65,7 @@ def read_rsl_rl(path: Path, activation: str | None) -> ImportedActor:
 
 
 def _version_4(content: Mapping[str, Any], path: Path) -> ImportedActor:
-    state = content["actor_state_dict"]
+    state = _state(content["actor_state_dict"], f"{path}: actor_state_dict")
     _check_only(state, r"mlp\.|obs_normalizer\.|distribution\.(std|log_std)_param$", path)
     return _actor(
         layers=_layers(state, "mlp", path),
@@ -71,18 +73,22 @@ def _version_4(content: Mapping[str, Any], path: Path) -> ImportedActor:
         std=state.get("distribution.std_param"),
         log_std=state.get("distribution.log_std_param"),
         iteration=content.get("iter", 0),
+        path=path,
     )
 
 
 def _version_1(content: Mapping[str, Any], path: Path) -> ImportedActor:
-    state = content["model_state_dict"]
+    state = _state(content["model_state_dict"], f"{path}: model_state_dict")
+    beside = content.get("obs_norm_state_dict")
     _check_only(state, r"(actor|critic)\.|(actor|critic)_obs_normalizer\.|(log_)?std$", path)
     return _actor(
         layers=_layers(state, "actor", path),
-        normalizer=_part(state, "actor_obs_normalizer.") or content.get("obs_norm_state_dict", {}),
+        normalizer=_part(state, "actor_obs_normalizer.")
+        or ({} if beside is None else _state(beside, f"{path}: obs_norm_state_dict")),
         std=state.get("std"),
         log_std=state.get("log_std"),
         iteration=content.get("iter", 0),
+        path=path,
     )
 
 
@@ -92,19 +98,42 @@ def _actor(
     normalizer: Mapping[str, np.ndarray],
     std: np.ndarray | None,
     log_std: np.ndarray | None,
-    iteration: int,
+    iteration: Any,
+    path: Path,
 ) -> ImportedActor:
     std = std if log_std is None else np.exp(log_std)
+    if std is not None and (std < 0.0).any():
+        raise InputError(f"{path}: std: found {std.min():g}; accepted: 0 or more")
+    if type(iteration) is not int or iteration < 0:
+        raise InputError(f"{path}: iter: found {str(iteration)[:40]!r}; accepted: a whole number, 0 or more")
     if not normalizer:
         return ImportedActor(layers, std=std, iteration=iteration)
     return ImportedActor(
         layers,
         mean=normalizer["_mean"].reshape(-1),
         scale=normalizer["_std"].reshape(-1) + np.float32(EPSILON),
-        count=float(normalizer.get("count", UNKNOWN_COUNT)),
+        count=_count(normalizer, path),
         std=std,
         iteration=iteration,
     )
+
+
+def _count(normalizer: Mapping[str, np.ndarray], path: Path) -> float:
+    """Observations behind a normaliser."""
+    count = normalizer.get("count", np.array(UNKNOWN_COUNT))
+    if count.size != 1 or not 0 <= count.item() < math.inf:
+        raise InputError(f"{path}: count: found {str(count.reshape(-1))[:40]}; accepted: one number, 0 or more")
+    return float(count.item())
+
+
+def _state(state: Any, where: str) -> dict[str, np.ndarray]:
+    """Tensors by name; a number is one too."""
+    if not isinstance(state, Mapping):
+        raise InputError(f"{where}: found a {type(state).__name__}; accepted: a dict of tensors")
+    for name, value in state.items():
+        if not isinstance(value, np.ndarray | np.generic | int | float):
+            raise InputError(f"{where}: {name}: found {str(value)[:40]}; accepted: a tensor")
+    return {str(name): np.asarray(value) for name, value in state.items()}
 
 
 def _layers(state: Mapping[str, np.ndarray], prefix: str, path: Path) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
@@ -154,7 +183,7 @@ def _said_activation(settings: Path) -> str | None:
         content = yaml.load(settings.read_text(), Loader=_PlainLoader)
     except FileNotFoundError:
         return None
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError) as error:  # ValueError: not UTF-8
         raise InputError(f"{settings}: not YAML: {str(error).splitlines()[0]}") from None
     for section in ("actor", "policy"):  # rsl_rl 4 and later, and before
         part = content.get(section) if isinstance(content, dict) else None

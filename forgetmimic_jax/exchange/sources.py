@@ -15,7 +15,8 @@ step_dt                    s between two actions
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,37 +30,62 @@ from forgetmimic_jax.tracking.layouts import LAYOUTS, UNSUPPORTED
 
 Facts = dict[str, Any]
 TABLES = ("default_joint_pos", "action_offset", "action_scale", "joint_stiffness", "joint_damping")
+# Of the tables whose numbers cannot be any: what is accepted, and whether a number is.
+BOUNDS: dict[str, tuple[str, Callable[[float], bool]]] = {
+    "action_scale": ("more than 0", lambda value: value > 0.0),
+    "joint_stiffness": ("more than 0", lambda value: value > 0.0),
+    "joint_damping": ("0 or more", lambda value: value >= 0.0),
+}
 DEPLOY, CONFIG = "deploy.yaml", "config.yaml"
+ROBOT_KEYS = ("robot_id", "robot_name", "robot")  # of a YAML
 # Isaac Lab's names of the same terms, in unitree_rl_lab and unitree_rl_mjlab.
 ISAAC_TERMS = {"motion_command": "command", "joint_pos_rel": "joint_pos", "joint_vel_rel": "joint_vel"}
 ISAAC_TERMS |= {"last_action": "actions"}
+GYM_HISTORY = "use_gym_history"  # a switch among unitree_rl_lab's terms
 _MODES = {name: mode for mode, name in ACTION_MODES.items()}
 
 
-def beside(policy: Path) -> tuple[str, Path, Mapping[str, Any]] | None:
-    """The kind, path and content of the YAML that describes a policy file.
+def beside(policy: Path, robot: Robot) -> list[tuple[str, Facts]]:
+    """The facts of every YAML that describes a policy file, and the YAML's name.
 
-    It is in the policy's folder, in params/ there, or in params/ beside that folder, as unitree_rl_lab has it.
+    They are in the policy's folder, in params/ there, or in params/ beside that folder, as unitree_rl_lab has it.
 
     Raises:
-        InputError: it is not YAML, or is HumanoidVerse's.
+        InputError: one is not YAML, is HumanoidVerse's or of another robot, or has a key of another form.
     """
-    for folder in _folders(policy):
-        for kind in (DEPLOY, CONFIG):
-            path = folder / kind
-            if not path.is_file():
-                continue
-            try:
-                content = yaml.safe_load(path.read_text())
-            except (yaml.YAMLError, UnicodeDecodeError) as error:
-                raise InputError(f"{path}: not YAML: {str(error).splitlines()[0]}") from None
-            content = content if isinstance(content, dict) else {}
-            if "obs_dict" in (content.get("obs") or {}):
-                raise InputError(f"{path}: obs.obs_dict: HumanoidVerse's layouts are not supported: they need "
-                                 f"{UNSUPPORTED['humanoidverse']}")  # fmt: skip
-            if kind == DEPLOY or "actor_observations" in content:  # other projects have a config.yaml too, as we have
-                return kind, path, content
-    return None
+    found = []
+    paths = [folder / kind for folder in _folders(policy) for kind in (DEPLOY, CONFIG)]
+    for path in filter(Path.is_file, paths):
+        content = _yaml(path)
+        # Other projects have a config.yaml too, as we have.
+        if path.name == DEPLOY or "actor_observations" in content:
+            _check_robot(content, robot, path)
+            read = from_deploy_yaml if path.name == DEPLOY else from_config_yaml
+            found.append((path, read(content, robot, str(path))))
+    names = [path.name for path, _ in found]
+    return [(path.name if names.count(path.name) == 1 else str(path), facts) for path, facts in found]
+
+
+def _yaml(path: Path) -> Mapping[str, Any]:
+    try:
+        content = yaml.safe_load(path.read_text())
+    except (yaml.YAMLError, ValueError) as error:  # ValueError: not UTF-8, or a date that is none
+        raise InputError(f"{path}: not YAML: {str(error).splitlines()[0]}") from None
+    content = content if isinstance(content, dict) else {}
+    if isinstance(content.get("obs"), dict) and "obs_dict" in content["obs"]:
+        raise InputError(f"{path}: obs.obs_dict: HumanoidVerse's layouts are not supported: they need "
+                         f"{UNSUPPORTED['humanoidverse']}")  # fmt: skip
+    return content
+
+
+def _check_robot(content: Mapping[str, Any], robot: Robot, path: Path) -> None:
+    """InputError for a name of another robot; `unitree_g1_29dof` is a name of g1, and g1 one of my_g1."""
+    ours = robot.name.lower()
+    for key in (key for key in ROBOT_KEYS if isinstance(content.get(key), str)):
+        words = re.findall(r"[a-z0-9]+", content[key].lower())
+        if not any(word in ours or ours in word for word in words):
+            raise InputError(f"{path}: {key}: found '{content[key]}'; accepted: {robot.name}: a policy of another "
+                             f"robot?")  # fmt: skip
 
 
 def motion_beside(policy: Path) -> Path | None:
@@ -87,21 +113,26 @@ def from_metadata(metadata: Mapping[str, str], robot: Robot, where: str) -> Fact
     for key, value in metadata.items():
         if "history" in key:
             _check_no_history(value.split(","), f"{where}: {key}")
-    facts: Facts = {key: metadata[key] for key in ("anchor_body_name",) if key in metadata}
+    facts: Facts = {key: metadata[key].strip() for key in ("anchor_body_name",) if key in metadata}
     for key in ("observation_names", "body_names"):
         if key in metadata:
-            facts[key] = tuple(metadata[key].split(","))
+            facts[key] = tuple(_split(metadata[key]))
     if "action_mode" in metadata:
-        facts["action_mode"] = _mode(metadata["action_mode"], f"{where}: action_mode")
+        facts["action_mode"] = _mode(metadata["action_mode"].strip(), f"{where}: action_mode")
     joints = robot.joint_names
     if "joint_names" in metadata:
-        joints = facts["joint_names"] = _joints(metadata["joint_names"].split(","), robot, f"{where}: joint_names")
+        joints = facts["joint_names"] = _joints(_split(metadata["joint_names"]), robot, f"{where}: joint_names")
     for key in TABLES:
         if key in metadata:
-            facts[key] = _table(metadata[key].split(","), joints, f"{where}: {key}")
+            facts[key] = _table(key, metadata[key].split(","), joints, f"{where}: {key}")
     if "step_dt" in metadata:
         facts["step_dt"] = _numbers([metadata["step_dt"]], 1, f"{where}: step_dt")[0]
     return facts
+
+
+def _split(names: str) -> list[str]:
+    """Names joined by commas, with or without spaces."""
+    return [name.strip() for name in names.split(",")]
 
 
 def from_deploy_yaml(content: Mapping[str, Any], robot: Robot, where: str) -> Facts:
@@ -117,26 +148,29 @@ def from_deploy_yaml(content: Mapping[str, Any], robot: Robot, where: str) -> Fa
     joints = robot.joint_names
     if "joint_ids_map" in content:
         places, field = content["joint_ids_map"], f"{where}: joint_ids_map"
-        if not isinstance(places, list) or sorted(map(str, places)) != sorted(map(str, range(robot.num_joints))):
-            found = f"{len(places)} places" if isinstance(places, list) else repr(places)
+        numbers = isinstance(places, list) and all(type(place) is int for place in places)
+        if not numbers or sorted(places) != list(range(robot.num_joints)):
+            found = f"{len(places)} places" if numbers else str(places)[:40]
             raise InputError(f"{field}: found {found}; the {robot.num_joints} joints of {robot.name} are needed, each "
                              f"once: a policy of another robot?")  # fmt: skip
         joints = facts["joint_names"] = tuple(robot.joint_names[place] for place in places)
     if "default_joint_pos" in content:
-        facts["default_joint_pos"] = _table(content["default_joint_pos"], joints, f"{where}: default_joint_pos")
+        pose = content["default_joint_pos"]
+        facts["default_joint_pos"] = _table("default_joint_pos", pose, joints, f"{where}: default_joint_pos")
     for key in ("stiffness", "damping"):
         if key in content:
-            facts[f"joint_{key}"] = _table(content[key], robot.joint_names, f"{where}: {key}")
-    actions = content.get("actions") or {}
+            facts[f"joint_{key}"] = _table(f"joint_{key}", content[key], robot.joint_names, f"{where}: {key}")
+    actions = _part(content, "actions", where)
     if actions:
         if list(actions) != ["JointPositionAction"]:
             raise InputError(f"{where}: actions: found {', '.join(map(str, actions))}; accepted: JointPositionAction")
-        action, field = actions["JointPositionAction"], f"{where}: actions.JointPositionAction"
+        field = f"{where}: actions.JointPositionAction"
+        action = _mapping(actions["JointPositionAction"], field)
         facts["action_mode"] = "offset"
         _check_unclipped(action.get("clip"), f"{field}.clip")
         for key in ("scale", "offset"):
             if action.get(key) is not None:
-                facts[f"action_{key}"] = _table(action[key], joints, f"{field}.{key}")
+                facts[f"action_{key}"] = _table(f"action_{key}", action[key], joints, f"{field}.{key}")
     if content.get("observations"):
         facts |= _terms(content["observations"], f"{where}: observations")
     if "step_dt" in content:
@@ -157,13 +191,13 @@ def from_config_yaml(content: Mapping[str, Any], robot: Robot, where: str) -> Fa
     for key in ("default_joint_pos", "stiffness", "damping"):
         if key in content:
             name = key if key in TABLES else f"joint_{key}"
-            facts[name] = _table(content[key], joints, f"{where}: {key}")
-    action, tracking = content.get("action") or {}, content.get("tracking") or {}
+            facts[name] = _table(name, content[key], joints, f"{where}: {key}")
+    action, tracking = _part(content, "action", where), _part(content, "tracking", where)
     if "action_mode" in action:
         facts["action_mode"] = _mode(action["action_mode"], f"{where}: action.action_mode")
     for key in ("scale", "offset"):
         if action.get(key) is not None:
-            facts[f"action_{key}"] = _table(action[key], joints, f"{where}: action.{key}")
+            facts[f"action_{key}"] = _table(f"action_{key}", action[key], joints, f"{where}: action.{key}")
     if content.get("actor_observations"):
         facts |= _terms(content["actor_observations"], f"{where}: actor_observations")
     if "anchor_body_name" in tracking:
@@ -186,8 +220,24 @@ def from_flags(layout: str | None, mode: str | None, order: Literal["robot", "is
     return facts
 
 
+def _part(content: Mapping[str, Any], key: str, where: str) -> Mapping[str, Any]:
+    """A table in a YAML; an empty one where the key is missing or null."""
+    return {} if content.get(key) is None else _mapping(content[key], f"{where}: {key}")
+
+
+def _mapping(value: Any, where: str) -> Mapping[str, Any]:
+    if not isinstance(value, dict):
+        raise InputError(f"{where}: found {str(value)[:40]}; a table is needed")
+    return value
+
+
 def _terms(content: Any, where: str) -> Facts:
     """Names and scales of terms, in their order."""
+    if isinstance(content, dict) and GYM_HISTORY in content:
+        if content[GYM_HISTORY] is not False:
+            raise InputError(f"{where}.{GYM_HISTORY}: found {content[GYM_HISTORY]}; accepted: false: its order is not "
+                             f"supported: it needs {UNSUPPORTED['history']}")  # fmt: skip
+        content = {name: term for name, term in content.items() if name != GYM_HISTORY}
     if not isinstance(content, dict) or not all(isinstance(term, dict) for term in content.values()):
         raise InputError(f"{where}: a table of terms is needed")
     names = {name: ISAAC_TERMS.get(str(name), str(name)) for name in content}
@@ -217,12 +267,16 @@ def _some(names: Iterable[str]) -> str:
     return ", ".join(names[:3] + ["…"] * (len(names) > 3)) or "none"
 
 
-def _table(values: Any, joints: Sequence[str], where: str) -> dict[str, float]:
-    """Numbers by joint; one number stands for every joint."""
+def _table(key: str, values: Any, joints: Sequence[str], where: str) -> dict[str, float]:
+    """The table `key` of a number for each joint; one number stands for every joint."""
     values = values if isinstance(values, list) else [values]
-    return dict(
-        zip(joints, _numbers(values * (len(joints) if len(values) == 1 else 1), len(joints), where), strict=True)
-    )
+    values = values * len(joints) if len(values) == 1 else values
+    table = dict(zip(joints, _numbers(values, len(joints), where), strict=True))
+    accepted, is_possible = BOUNDS.get(key, ("", lambda value: True))
+    for joint, value in table.items():
+        if not is_possible(value):
+            raise InputError(f"{where}: {joint}: found {value:g}; accepted: {accepted}")
+    return table
 
 
 def _numbers(values: Any, count: int, where: str) -> list[float]:
@@ -241,9 +295,9 @@ def _numbers(values: Any, count: int, where: str) -> list[float]:
 
 
 def _mode(name: Any, where: str) -> str:
-    if name not in _MODES:
+    if str(name) not in _MODES:
         raise InputError(f"{where}: found '{name}'; accepted: {', '.join(_MODES)}")
-    return _MODES[name]
+    return _MODES[str(name)]
 
 
 def _check_no_history(lengths: Iterable[Any], where: str) -> None:

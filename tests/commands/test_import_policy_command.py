@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -124,6 +125,7 @@ def test_a_reference_must_be_met(with_clip, robot, library, tmp_path, refused):
     finished(import_policy.main, options)
     for content, message in (
         ("[", "neither JSON nor YAML: "),
+        ("{}", "found {}; accepted: a table of reward, joint_error, survival"),
         ("3", "found 3; accepted: a table of reward, joint_error, survival"),
         ("{speed: 1}", "speed: found 1; accepted: numbers of reward, joint_error, survival"),
     ):
@@ -143,6 +145,7 @@ def test_what_was_exported_comes_back_as_it_went(base_run, library_folder, robot
     file, output = tmp_path / "policy.onnx", tmp_path / "back"
     there = load_policy(base_run.checkpoint(4))
     onnx.save(to_onnx(there, robot, checkpoint.read_info(base_run.checkpoint(4)).config, run_path=""), file)
+    (tmp_path / "notes.csv").write_text("no,motion")  # which --library replaces
     message = finished(
         import_policy.main,
         import_policy.Options(files=(file,), library=library_folder, std=0.7, episodes=1, output=output),
@@ -184,6 +187,15 @@ def options(library_folder):
 )
 def test_what_cannot_be_is_refused_in_one_line(refused, options, given, message):
     assert refused(import_policy.main, options(**given)) == message
+
+
+def test_a_policy_that_falls_is_warned_about_with_what_was_assumed_of_it(options, tmp_path, capfd, monkeypatch):
+    monkeypatch.setattr(adopt, "LEAST_SURVIVAL", 1.1)  # so that it falls, whatever it does
+    finished(import_policy.main, options(output=tmp_path / "out"))
+    (warning,) = [line for line in capfd.readouterr().err.splitlines() if line.startswith("warning: ")]
+    assert re.match(rf"warning: {RSL_RL}: the policy falls: survival: sway \d+%, turn \d+%, nod \d+%; ", warning)
+    assert "scale (no action_scale), stiffness (no joint_stiffness), " in warning
+    assert "layout" not in warning  # which the flags said
 
 
 def test_files_are_named_without_a_flag():
@@ -245,6 +257,7 @@ def merged(two_files, tmp_path_factory):
         patch.setattr(experts, "shortfalls", lambda known, found: next(behind))
         patch.setattr(experts, "ROBOTS", 8)
         patch.setattr(experts, "STUDENT_LAYERS", (16,))
+        patch.setattr(adopt, "LEAST_SURVIVAL", 0.0)  # the invented policies fall
         options = import_policy.Options(files=two_files, layout="mjlab154", episodes=1, output=output)
         yield finished(import_policy.main, options)
 
@@ -274,6 +287,15 @@ def test_several_policies_become_one_base_with_all_clips(merged, robot):
 def test_policies_that_cannot_become_one_are_refused(refused, two_files, change, message):
     options = import_policy.Options(files=two_files, output=Path("out"), **change)
     assert refused(import_policy.main, options).startswith(message)
+
+
+def test_a_policy_that_falls_becomes_no_part_of_a_base(two_files, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(adopt, "LEAST_SURVIVAL", 0.5)
+    options = import_policy.Options(files=two_files, layout="mjlab154", episodes=1, output=Path("out"))
+    with pytest.raises(InputError, match=rf"^{two_files[0]}: the policy falls: survival: kick 0%; 50% or more is exp"):
+        import_policy.main(options)
+    assert not any(tmp_path.iterdir())
 
 
 def test_policies_of_other_gains_without_clips_or_of_one_clip_are_refused(refused, two_files, robot, library, tmp_path):

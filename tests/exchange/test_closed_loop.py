@@ -7,6 +7,8 @@ import pytest
 from invented import invented_policy
 from orders import isaac_order
 
+from forgetmimic_jax import export
+from forgetmimic_jax.evaluation.metrics import Rollout
 from forgetmimic_jax.evaluation.rollout import Evaluator
 from forgetmimic_jax.exchange.closed_loop import run_episodes
 from forgetmimic_jax.exchange.onnx_actor import OnnxActor, to_onnx
@@ -61,8 +63,25 @@ def record(evaluator, exported, robot, library):
     return run_episodes(exported, robot, library, evaluator.config, evaluator.start())
 
 
-def test_the_robot_fares_as_in_the_evaluation(record, evaluator, gentle):
-    expected, found = evaluator.rollout(gentle), record.rollout
+@pytest.fixture(scope="module")
+def expected(evaluator, gentle) -> Rollout:
+    return evaluator.rollout(gentle)
+
+
+def test_an_export_that_has_one_joints_scale_wrong_by_a_tenth_is_told_from_a_right_one(
+    record, expected, evaluator, gentle, setup, robot, library
+):
+    assert export.early_agreement(expected, record.rollout) == 1.0
+    model = to_onnx(gentle, setup.robot, setup.config, run_path="")
+    (entry,) = [entry for entry in model.metadata_props if entry.key == "action_scale"]
+    first, *others = entry.value.split(",")
+    entry.value = ",".join([str(1.1 * float(first)), *others])
+    wrong = run_episodes(OnnxActor(model.SerializeToString()), robot, library, evaluator.config, evaluator.start())
+    assert export.early_agreement(expected, wrong.rollout) < 0.5 < export.EARLY_SHARE
+
+
+def test_the_robot_fares_as_in_the_evaluation(record, expected):
+    found = record.rollout
     for field in ("clip", "start_frame", "horizon"):
         np.testing.assert_array_equal(getattr(found, field), getattr(expected, field))
     assert (expected.length < expected.horizon).any()

@@ -9,6 +9,7 @@ from foreign_files import lab_folder, mjlab_file, wbc_folder
 from loops import from_config_yaml, from_deploy_yaml, from_metadata, in_its_own_loop, in_the_environment
 from orders import isaac_order
 
+from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.exchange import experts
 from forgetmimic_jax.exchange.adopt import own_setup
 from forgetmimic_jax.exchange.foreign import Reading, read_policy
@@ -18,6 +19,7 @@ from forgetmimic_jax.robot.model import load_robot
 from forgetmimic_jax.settings.config import ActionConfig, ObservationConfig
 from forgetmimic_jax.tracking.env import make_assets
 from forgetmimic_jax.tracking.setup import Setup
+from forgetmimic_jax.training.distil import DistilState
 from forgetmimic_jax.training.start import fresh_policy
 
 STEPS = 12
@@ -68,6 +70,19 @@ def test_the_student_has_the_common_layout_the_robots_pose_and_the_experts_bound
     assert config.termination.contact_force == 100.0
     other = experts.student_config(tiny_config, [one, one], robot, "wbc132", "residual")
     assert (other.observation.layout, other.action.mode) == ("wbc132", "residual")
+
+
+def test_a_regression_whose_loss_is_no_number_ends_at_once(robot, library, tiny_config, tmp_path, monkeypatch):
+    foreign = read_policy(mjlab_file(tmp_path / "a.onnx", robot, library), robot, 0.02, Reading())
+    setup = own_setup(foreign.config(tiny_config), [foreign.clip])
+    monkeypatch.setattr(experts, "make_teaching", lambda assets, teachers: None)
+    monkeypatch.setattr(experts, "begin", lambda *_: DistilState(None, None, None, None, None))
+    losses = iter([{"action_error": 0.5}, {"action_error": float("nan")}])
+    monkeypatch.setattr(
+        experts, "make_round", lambda env, config: lambda assets, teaching, state: (state, next(losses))
+    )
+    with pytest.raises(InputError, match=r"^regression on the policies: action_error: found nan in round 2; accepted"):
+        experts.merge(setup, [], lambda student: True)
 
 
 def tracked(survival: float, reward: float) -> Tracked:

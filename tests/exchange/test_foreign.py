@@ -172,6 +172,22 @@ def test_a_clip_in_another_order_of_joints_and_bodies_is_read_by_their_names(rob
     np.testing.assert_allclose(rebuilt.joint_pos, ours.joint_pos, atol=2e-5)
 
 
+@pytest.mark.parametrize("names", [{}, {"body_names": None}])
+def test_a_clip_inside_that_does_not_fit_its_own_bodies_is_refused(robot, library, tmp_path, names):
+    said = {key: value for key, value in (metadata(robot, "mjlab160") | names).items() if value is not None}
+    right = clip_tables(library)
+    assert read(network(tmp_path / "a.onnx", 160, metadata=said, tables=right), robot).clip is not None
+    others = {
+        "quaternions xyzw": right | {"body_quat_w": np.roll(right["body_quat_w"], -1, axis=-1)},
+        "orientations of other bodies": right | {"body_quat_w": right["body_quat_w"][:, [0, *range(13, 0, -1)]]},
+        "joints of the other side": right | {"joint_pos": right["joint_pos"][:, robot.counterpart]},
+    }
+    for what, tables in others.items():
+        path = network(tmp_path / f"{what}.onnx", 160, metadata=said, tables=tables)
+        with pytest.raises(InputError, match=rf"^{path}: the clip inside: forward kinematics: \w+ lies .* m from g1's"):
+            read(path, robot)
+
+
 def test_garbage_in_the_first_frames_is_named_and_can_be_left_out(robot, library, tmp_path):
     tables = clip_tables(library)
     tables["joint_pos"][0, 3] += 1.0  # the left knee moves 1 rad in 0.02 s, past 20 rad/s
@@ -183,6 +199,9 @@ def test_garbage_in_the_first_frames_is_named_and_can_be_left_out(robot, library
     left = read(file, robot, start=0.04)
     assert left.doubts == ()
     assert left.clip.num_frames == 78
+    for start in ("nan", "inf", "-0.1", "1.2"):
+        with pytest.raises(InputError, match=rf"^--start: found {start}; a has 1\.60 s, and half a second must remain"):
+            read(file, robot, start=float(start))
 
 
 def test_a_clip_beside_a_policy_is_taken_at_the_rate_in_its_name(robot, tmp_path):
@@ -198,6 +217,8 @@ def test_a_clip_beside_a_policy_is_taken_at_the_rate_in_its_name(robot, tmp_path
     with pytest.raises(InputError, match=r"take\.csv: fps: "):
         read(file, robot)
     assert read(file, robot, fps=50.0).clip.num_frames == 80
+    motion.with_name("take.csv").write_text("no,motion\n")
+    assert read(file, robot, own_clip=False).clip is None  # a file that is no motion stops nothing then
     (motion.parent / "other.csv").write_text("")  # two: which one is its clip is not said
     assert read(file, robot).clip is None
 
@@ -237,6 +258,9 @@ def changed(table: dict, path: str, value) -> dict:
         ({"action_scale": "0.25,0.25"}, "action_scale: found 2 numbers; 29 are needed"),
         ({"joint_stiffness": "stiff"}, "joint_stiffness: found ['stiff', 'stiff', "),
         ({"joint_damping": "nan"}, "joint_damping: found nan; finite numbers are needed"),
+        ({"joint_damping": "-1"}, "joint_damping: left_hip_pitch_joint: found -1; accepted: 0 or more"),
+        ({"joint_stiffness": "0"}, "joint_stiffness: left_hip_pitch_joint: found 0; accepted: more than 0"),
+        ({"action_scale": "-0.25"}, "action_scale: left_hip_pitch_joint: found -0.25; accepted: more than 0"),
         ({"action_mode": "velocity"}, "action_mode: found 'velocity'; accepted: reference_residual, default_relative"),
         ({"step_dt": "0.01"}, "step_dt: the metadata says 0.01 s; accepted: 0.02 s"),
         ({"observation_history_lengths": "1,1,5"}, "observation_history_lengths: found 5: not supported: it needs a h"),
@@ -254,6 +278,10 @@ def test_metadata_that_cannot_be_are_refused(robot, library, tmp_path, changes, 
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
+        ("joint_ids_map", [str(place) for place in range(29)], "joint_ids_map: found ['0', '1', '2', "),
+        ("actions", ["JointPositionAction"], "actions: found ['JointPositionAction']; a table is needed"),
+        ("actions.JointPositionAction", None, "actions.JointPositionAction: found None; a table is needed"),
+        ("observations.use_gym_history", True, "observations.use_gym_history: found True; accepted: false: its order"),
         ("joint_ids_map", list(range(23)), "joint_ids_map: found 23 places; the 29 joints of g1 are needed, each once"),
         ("stiffness", [1.0] * 28, "stiffness: found 28 numbers; 29 are needed"),
         ("actions", {"JointVelocityAction": {}}, "actions: found JointVelocityAction; accepted: JointPositionAction"),
@@ -264,6 +292,12 @@ def test_metadata_that_cannot_be_are_refused(robot, library, tmp_path, changes, 
         ),
         ("observations.last_action.history_length", 5, "observations.last_action.history_length: found 5: not supp"),
         ("observations.base_ang_vel.clip", [-5, 5], "observations.base_ang_vel.clip: found [-5, 5]; accepted: null"),
+        ("damping", [1.0] * 28 + [-2.0], "damping: right_wrist_yaw_joint: found -2; accepted: 0 or more"),
+        (
+            "actions.JointPositionAction.scale",
+            0.0,
+            "actions.JointPositionAction.scale: left_hip_pitch_joint: found 0; accepted: more than 0",
+        ),
         ("observations", 3, "observations: a table of terms is needed"),
         ("default_joint_pos", ["x"] * 29, "default_joint_pos: found ['x', 'x', "),
     ],
@@ -324,6 +358,48 @@ def test_isaac_labs_order_can_be_given_where_nothing_says_it(robot, tmp_path):
     assert read(file, robot, layout="mjlab154", order="robot").description.action.joint_order == ()
     found = read(file, robot, layout="mjlab154", order="isaac").description.action.joint_order
     assert found == isaac_order(robot)
+
+
+def test_every_yaml_of_a_policy_is_read_and_two_that_disagree_are_named(robot, tmp_path):
+    file = wbc_folder(tmp_path, robot)
+    table = deploy_table(robot, "wbc132") | {"joint_ids_map": list(range(29))}
+    table |= {key: config_table(robot)[key] for key in ("default_joint_pos", "stiffness", "damping")} | {"actions": {}}
+    for folder in (tmp_path, tmp_path / "params"):
+        folder.mkdir(exist_ok=True)
+        (folder / "deploy.yaml").write_text(yaml.safe_dump(table, sort_keys=False))
+    assert sources(read(file, robot))["stiffness"] == f"joint_stiffness, {tmp_path / 'params' / 'deploy.yaml'}"
+    table["stiffness"] = [50.0] * 29
+    (tmp_path / "deploy.yaml").write_text(yaml.safe_dump(table, sort_keys=False))
+    (tmp_path / "params" / "deploy.yaml").unlink()
+    with pytest.raises(InputError, match=r"joint_stiffness: left_hip_pitch_joint: deploy.yaml says 50, config.yaml sa"):
+        read(file, robot)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("robot_id", "h1", "robot_id: found 'h1'; accepted: g1: a policy of another robot?"),
+        ("robot", "unitree_go2", "robot: found 'unitree_go2'; accepted: g1: a policy of another robot?"),
+        ("action", "x", "action: found x; a table is needed"),
+        ("tracking", ["x"], "tracking: found ['x']; a table is needed"),
+        ("action.action_mode", [1], "action.action_mode: found '[1]'; accepted: reference_residual, default_relative"),
+    ],
+)
+def test_a_config_yaml_that_cannot_be_is_refused(robot, tmp_path, key, value, message):
+    file = wbc_folder(tmp_path, robot, changed(config_table(robot), key, value))
+    with pytest.raises(InputError) as error:
+        read(file, robot)
+    assert str(error.value) == f"{tmp_path / 'config.yaml'}: {message}"
+
+
+def test_other_spellings_are_read(robot, library, tmp_path):
+    """Spaces after commas, longer names of the robot, and a history that is switched off."""
+    spaced = {key: value.replace(",", ", ") for key, value in metadata(robot, "mjlab160").items()}
+    path = mjlab_file(tmp_path / "a" / "kick.onnx", robot, library, **spaced)
+    assert values(read(path, robot)) == values(read(mjlab_file(tmp_path / "b" / "kick.onnx", robot, library), robot))
+    table = config_table(robot) | {"robot_id": "unitree_g1_29dof"}
+    table["actor_observations"]["use_gym_history"] = False
+    assert values(read(wbc_folder(tmp_path / "c", robot, table), robot))["layout"] == "wbc132"
 
 
 def test_another_projects_config_yaml_is_passed_over_and_humanoidverses_is_named(robot, library, tmp_path):

@@ -10,6 +10,7 @@ from forgetmimic_jax.exchange.onnx_actor import OnnxActor, to_onnx
 from forgetmimic_jax.exchange.onnx_reader import read_onnx
 
 RSL_RL = Path(__file__).parent / "rsl_rl" / "rsl_rl_5.5.1.onnx"
+POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n"
 OBSERVATIONS = np.random.default_rng(0).normal(size=(10, 132)).astype(np.float32)
 
 
@@ -141,5 +142,17 @@ def test_what_is_no_model_is_told(tmp_path):
     with pytest.raises(InputError, match=rf"^{path}: not a readable ONNX model: "):
         read_onnx(path)
     path.write_bytes(b"")
-    with pytest.raises(InputError, match=rf"^{path}: "):
+    with pytest.raises(InputError, match=rf"^{path}: an empty file; an ONNX model is needed$"):
+        read_onnx(path)
+    path.write_bytes(POINTER)
+    with pytest.raises(InputError, match=rf"^{path}: this is a Git LFS pointer, not the file: run git lfs pull$"):
+        read_onnx(path)
+
+
+def test_weights_of_their_own_that_are_a_git_lfs_pointer_are_told(exported, tmp_path):
+    path, weights = tmp_path / "policy.onnx", tmp_path / "policy.onnx.data"
+    onnx.save(exported, path, save_as_external_data=True, location=weights.name, size_threshold=0)
+    assert read_onnx(path).actor.layers
+    weights.write_bytes(POINTER)
+    with pytest.raises(InputError, match=rf"^{weights}: this is a Git LFS pointer, not the file: run git lfs pull$"):
         read_onnx(path)

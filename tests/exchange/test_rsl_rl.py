@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from forgetmimic_jax.basics.errors import InputError
+from forgetmimic_jax.exchange import rsl_rl
 from forgetmimic_jax.exchange.rsl_rl import read_rsl_rl, read_tensors
 
 POLICIES = Path(__file__).parent / "rsl_rl"  # written by rsl_rl itself: make_rsl_rl_policies.py
@@ -55,6 +56,9 @@ def test_the_activation_is_taken_from_the_settings_beside_it(copy, section):
         read_rsl_rl(copy, None)
     with pytest.raises(InputError, match=rf"--activation: found elu, but {path} says relu; leave the flag out$"):
         read_rsl_rl(copy, "elu")
+    path.write_bytes(b"# \xe9\n")  # Latin 1
+    with pytest.raises(InputError, match=rf"^{path}: not YAML: 'utf-8' codec"):
+        read_rsl_rl(copy, None)
 
 
 def test_settings_run_nothing(copy):
@@ -131,6 +135,42 @@ def test_a_tensor_beyond_its_storage_is_told(tmp_path, shown):
         read_tensors(tensor_file(tmp_path / "m.pt", shown, STORAGE))
 
 
+LAYERS = {f"actor.{n}.{what}": np.zeros(shape) for n, sizes in ((0, (8, 132)), (2, (29, 8)))
+          for what, shape in (("weight", sizes), ("bias", sizes[:1]))}  # fmt: skip
+NORM = {"_mean": np.zeros((1, 132)), "_std": np.ones((1, 132)), "count": 500}
+
+
+@pytest.mark.parametrize(
+    ("state", "others", "message"),
+    [
+        ({}, {"iter": None}, "iter: found 'None'; accepted: a whole number, 0 or more"),
+        ({}, {"iter": "x"}, "iter: found 'x'; accepted: a whole number, 0 or more"),
+        ({}, {"obs_norm_state_dict": NORM | {"count": -5}}, "count: found [-5]; accepted: one number, 0 or more"),
+        (
+            {},
+            {"obs_norm_state_dict": NORM | {"count": None}},
+            "obs_norm_state_dict: count: found None; accepted: a tensor",
+        ),
+        ({}, {"obs_norm_state_dict": [1]}, "obs_norm_state_dict: found a list; accepted: a dict of tensors"),
+        ({}, {"model_state_dict": [1]}, "model_state_dict: found a list; accepted: a dict of tensors"),
+        ({}, {"actor_state_dict": None}, "actor_state_dict: found a NoneType; accepted: a dict of tensors"),
+        ({"std": np.full(29, -0.5)}, {}, "std: found -0.5; accepted: 0 or more"),
+        ({"std": None}, {}, "model_state_dict: std: found None; accepted: a tensor"),
+        ({"actor.0.weight": 3}, {}, "actor.0.weight: found shape [] as module 0; accepted: linear layers with an"),
+    ],
+)
+def test_a_checkpoint_with_values_that_cannot_be_is_told(tmp_path, monkeypatch, state, others, message):
+    content = {"model_state_dict": {**LAYERS, "std": np.ones(29)}, "obs_norm_state_dict": NORM, "iter": 3}
+    path = tmp_path / "model.pt"
+    monkeypatch.setattr(rsl_rl, "read_tensors", lambda path: content)  # arrays without torch's pickle
+    assert read_rsl_rl(path, "elu").count == 500
+    content["model_state_dict"] |= state
+    content |= others
+    with pytest.raises(InputError) as error:
+        read_rsl_rl(path, "elu")
+    assert str(error.value).startswith(f"{path}: {message}")
+
+
 def test_what_is_no_such_checkpoint_is_told(tmp_path):
     def message(path: Path) -> str:
         with pytest.raises(InputError) as error:
@@ -141,6 +181,9 @@ def test_what_is_no_such_checkpoint_is_told(tmp_path):
     old = tmp_path / "old.pt"
     old.write_bytes(b"\x80\x02\x8a\nl\xfc\x9cF")
     assert message(old) == "not a file of torch.save (torch 1.6 or later)"
+    pointer = tmp_path / "pointer.pt"
+    pointer.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n")
+    assert message(pointer) == "this is a Git LFS pointer, not the file: run git lfs pull"
     assert message(saved(tmp_path / "list.pt", [1])) == "found a list; accepted: the dict that rsl_rl saves"
     assert message(saved(tmp_path / "other.pt", {"iter": 3})).startswith("found iter; accepted: actor_state_dict or ")
     assert message(saved(tmp_path / "half.pt", pickle.dumps({"iter": 3})[:-3])).startswith("damaged: ")
