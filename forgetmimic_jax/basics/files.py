@@ -9,6 +9,18 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from forgetmimic_jax.basics.errors import InputError
+
+POINTER = b"version https://git-lfs"  # how a Git LFS pointer begins
+
+
+def check_no_pointer(path: Path) -> None:
+    """InputError if a file is a Git LFS pointer, a small text in its place; one that is not there is none."""
+    if path.is_file():
+        with path.open("rb") as file:
+            if file.read(len(POINTER)) == POINTER:
+                raise InputError(f"{path}: this is a Git LFS pointer, not the file: run git lfs pull")
+
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
     """The rows of a file, if there is one. Half a row, as a killed run may leave at the end, is none."""

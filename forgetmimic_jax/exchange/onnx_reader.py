@@ -14,9 +14,9 @@ from onnx.external_data_helper import load_external_data_for_model
 from onnx.reference import ReferenceEvaluator
 
 from forgetmimic_jax.basics.errors import InputError
+from forgetmimic_jax.basics.files import check_no_pointer
 from forgetmimic_jax.exchange.imported import ImportedActor
 from forgetmimic_jax.exchange.onnx_actor import INPUT, OUTPUT
-from forgetmimic_jax.exchange.pointers import check_no_pointer
 from forgetmimic_jax.policy.normalizer import OBSERVATION_LIMIT
 from forgetmimic_jax.tracking.layouts import UNSUPPORTED
 

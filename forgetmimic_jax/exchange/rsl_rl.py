@@ -20,8 +20,8 @@ import numpy as np
 import yaml
 
 from forgetmimic_jax.basics.errors import InputError
+from forgetmimic_jax.basics.files import check_no_pointer
 from forgetmimic_jax.exchange.imported import UNKNOWN_COUNT, ImportedActor
-from forgetmimic_jax.exchange.pointers import check_no_pointer
 from forgetmimic_jax.motion.unpickle import NumbersOnly, Refused
 
 EPSILON = 0.01  # of EmpiricalNormalization

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Literal
 
 from forgetmimic_jax.basics.errors import InputError
+from forgetmimic_jax.basics.files import check_no_pointer
 from forgetmimic_jax.motion.archives import read_npz
 from forgetmimic_jax.motion.clip import Clip, default_name
 from forgetmimic_jax.motion.columns import read_csv
@@ -31,7 +32,6 @@ READERS: dict[str, Callable[[Robot, Path], Recording]] = {
     ".pkl": read_pickle,
     ".pickle": read_pickle,
 }
-LFS = b"version https://git-lfs"
 RATES = (5.0, 1000.0)  # Hz
 
 
@@ -81,9 +81,7 @@ def _recording(robot: Robot, path: Path) -> Recording:
         raise InputError(f"{path}: suffix: found '{path.suffix}'; accepted: {', '.join(READERS)}")
     if not path.is_file():
         raise InputError(f"{path}: not found")
-    with path.open("rb") as file:
-        if file.read(len(LFS)) == LFS:
-            raise InputError(f"{path}: this is a Git LFS pointer, not the file: run git lfs pull")
+    check_no_pointer(path)
     return READERS[path.suffix.lower()](robot, path)
 
 

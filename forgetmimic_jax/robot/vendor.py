@@ -16,11 +16,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from forgetmimic_jax.basics.errors import InputError
+from forgetmimic_jax.basics.files import check_no_pointer
 from forgetmimic_jax.robot.check import FLOOR
 from forgetmimic_jax.robot.shapes import FRICTION, KINDS, Sphere, give_way, set_shapes
 
-LFS = b"version https://git-lfs"  # how a Git LFS pointer begins
 SETTINGS = ("timestep", "integrator", "iterations", "ls_iterations")  # of <option>, which the project's settings say
 FLAGS = {"disableflags": mujoco.mjtDisableBit, "enableflags": mujoco.mjtEnableBit}
 NAMED = {"cone": mujoco.mjtCone, "jacobian": mujoco.mjtJacobian, "solver": mujoco.mjtSolver}
@@ -67,7 +66,7 @@ def read_unmended(file: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel, list[str]]
         Unreadable: MuJoCo does not read it.
         InputError: it is a Git LFS pointer, or a file that it names is.
     """
-    _refuse_pointer(file)
+    check_no_pointer(file)
     notes: list[str] = []
     try:
         with warnings.catch_warnings(record=True) as said:
@@ -75,7 +74,7 @@ def read_unmended(file: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel, list[str]]
             spec = mujoco.MjSpec.from_file(str(file))
         notes += _in_a_line_each(said)
         for name, folder in _files(spec, file):
-            _refuse_pointer(folder / name)
+            check_no_pointer(folder / name)
         _leave_out_missing_meshes(spec, file, notes)
         _leave_out_missing_textures(spec, file, notes)
         _name_all(spec)
@@ -104,15 +103,6 @@ def _files(spec: mujoco.MjSpec, file: Path) -> list[tuple[str, Path]]:
     textures = [name for texture in spec.textures for name in (texture.file, *texture.cubefiles)]
     folders = ((meshes, file.parent / spec.meshdir), (textures, file.parent / spec.texturedir))
     return [(name, folder) for names, folder in folders for name in names]
-
-
-def _refuse_pointer(file: Path) -> None:
-    """A file that Git LFS has not fetched."""
-    if not file.is_file():
-        return
-    with file.open("rb") as content:
-        if content.read(len(LFS)) == LFS:
-            raise InputError(f"{file}: this is a Git LFS pointer, not the file: run git lfs pull")
 
 
 def _leave_out_missing_meshes(spec: mujoco.MjSpec, file: Path, notes: list[str]) -> None:
