@@ -70,7 +70,8 @@ def body(document: Document) -> str:
             "with the clips' weights.\n"
         )
         steps = {"distill": distill.PACE.ppo["cpu"], "stand": stand.PACE.ppo["cpu"], "the others": SHORT}
-        counts = ", ".join(f"{name} {of['minibatches'] * of['epochs']}" for name, of in steps.items())
+        shown = {name: of for name, of in steps.items() if name in variants or name == "the others"}
+        counts = ", ".join(f"{name} {of['minibatches'] * of['epochs']}" for name, of in shown.items())
         parts.append(f"Gradient steps an iteration: {counts}.\n")
     if CONTROL in variants:
         header = ["", "kept success - base's, points", "- the control's", "kept tracking / base's", "/ the control's"]

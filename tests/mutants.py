@@ -427,7 +427,7 @@ MUTANTS = (
            "sum(ends)"),
     Mutant("verdict_below", "forgetmimic_jax/evaluation/verdict.py", "tests/evaluation/test_verdict.py",
            "A policy below the zero-action baseline can be consistent with retraining.",
-           "for clip, skill in target.items() if skill.high < 0.0}",
+           "for clip, skill in target.items() if skill.high < BELOW}",
            "for clip, skill in target.items() if skill.high < -inf}"),
     # What a policy does instead, and when a run stops.
     Mutant("stand_last_action", "forgetmimic_jax/unlearning/stand.py", "tests/unlearning/test_stand_method.py",

@@ -22,6 +22,7 @@ from forgetmimic_jax.evaluation.relearning import Lasted, lasted
 from forgetmimic_jax.evaluation.tables import FORGOTTEN, KEPT, KEPT_CLIP, number, percent
 from forgetmimic_jax.evaluation.verdict import (
     ALIKE,
+    BELOW,
     CONSISTENT,
     FAILED,
     FASTER,
@@ -250,7 +251,7 @@ def _control_is_usable(evidence: EvidenceDocument) -> str:
 
 def _over_forgotten(targets: Marks) -> list[str]:
     """A doubt where a target is below the zero-action baseline: no retrained policy is."""
-    below = [f"{clip} {skill}" for clip, skill in _skills(targets).items() if skill.high < 0.0]
+    below = [f"{clip} {skill}" for clip, skill in _skills(targets).items() if skill.high < BELOW]
     if not below:
         return []
     return [f"Over-forgotten: below the zero-action baseline ({', '.join(below)} of the base's skill)."]

@@ -27,6 +27,7 @@ INCONCLUSIVE, FAILED = "inconclusive", "failed"
 # intervals come on top, so that a smaller share would separate retrained policies from each other. It is a share, since
 # a difference in tracking that is little on an easy clip is all of the skill on a hard one.
 ALIKE = 0.2
+BELOW = -0.005  # a skill that is less than 0 %, also when it is rounded: below the zero-action baseline
 FASTER = 0.5  # relearning within this share of the control's target steps means that some skill was only hidden
 
 
@@ -130,7 +131,7 @@ def judge(
         found.append(
             f"Not judged, since the base itself is hardly better than the zero-action baseline: {', '.join(undefined)}."
         )
-    below = {clip: skill for clip, skill in target.items() if skill.high < 0.0}
+    below = {clip: skill for clip, skill in target.items() if skill.high < BELOW}
     if below:
         found.append(f"It is below the zero-action baseline: over-forgotten ({_by_clip(below)} of the base's skill).")
 

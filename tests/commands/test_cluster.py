@@ -7,7 +7,6 @@ import dataclasses
 import json
 import os
 import re
-import shutil
 import signal
 import threading
 from pathlib import Path
@@ -19,7 +18,7 @@ from distributed import Client, LocalCluster
 from miniature import TINY, Run, load_state
 from waiting import until
 
-from forgetmimic_jax import evidence, pretrain, sweep
+from forgetmimic_jax import pretrain, sweep
 from forgetmimic_jax.basics.provenance import cores
 from forgetmimic_jax.evaluation.document import read_evaluation
 from forgetmimic_jax.settings.config import load_config
@@ -28,6 +27,7 @@ from forgetmimic_jax.studies import executor, trials
 from forgetmimic_jax.studies.executor import RESOURCE
 from forgetmimic_jax.studies.task import Task
 from forgetmimic_jax.studies.trials import Trial, make_trial, run_trials
+from forgetmimic_jax.training.checkpoint import BEST, policy_hash, read_info
 
 LENGTH = 30  # iterations, with a checkpoint every two: long enough to be killed on the way
 
@@ -80,14 +80,17 @@ def test_a_trial_whose_worker_is_killed_ends_on_the_other_as_it_would_have(clust
     assert measured[0]["policies"] == measured[1]["policies"]
 
 
-def test_a_base_is_trained_on_a_cluster(cluster, library_folder, tmp_path, capsys):
+def test_a_control_is_trained_and_evaluated_on_a_cluster(cluster, library_folder, tmp_path, capsys):
     settings = [*TINY, "evaluate_every=2", "evaluate_episodes=2"]
-    given = {"library": library_folder, "base": Path("none"), "iterations": 2, "episodes": 2, "set": [settings]}
+    given = {"library": library_folder, "without": "turn", "iterations": 2, "episodes": 2, "set": [settings]}
     where = {"seeds": 1, "seed": 3, "cluster": cluster.scheduler_address, "output": tmp_path / "base"}
     pretrain.main(pretrain.Options(**given, **where))
     folder = tmp_path / "base-3"
     assert load_config(folder / "config.yaml").seed == 3
-    assert set(read_evaluation(folder / "evaluation.json").policies) == {"base", "zero_action"}
+    best, document = read_info(folder / BEST), read_evaluation(folder / "evaluation.json")
+    assert (document.episodes, document.targets, set(document.policies)) == (2, ["turn"], {"retrained", "zero_action"})
+    assert document.policy_hashes == {"retrained": policy_hash(best)}
+    assert f"Next: make play ROBOT=g1 CHECKPOINT={best.path}" in (tmp_path / "base-3.log").read_text()
     assert re.search(rf"^base-3 +{folder}$", capsys.readouterr().out, re.MULTILINE)
 
 
@@ -128,16 +131,6 @@ def test_every_seed_of_a_pretraining_is_a_task(submitted, library_folder, tmp_pa
     for seed, task in zip((4, 5), found.tasks, strict=True):
         assert parse(pretrain.Options, "pretrain", task.flags) == dataclasses.replace(one, seed=seed)
         assert (task.command, task.iterations, task.adds) == ("pretrain", 400, False)
-
-
-def test_every_run_to_attack_is_a_task(submitted, unlearned_run, tmp_path):
-    runs = [shutil.copytree(unlearned_run.folder, tmp_path / name) for name in ("a", "b")]
-    one = evidence.Options(run=Path("a"), full=True, recovery_iterations=7)
-    found = submitted(evidence.main, dataclasses.replace(one, run=Path(",".join(map(str, runs))), **WHERE))
-    assert found.where == WHERE
-    for run, task in zip(runs, found.tasks, strict=True):
-        assert parse(evidence.Options, "evidence", task.flags) == dataclasses.replace(one, run=run)
-        assert (task.folder, task.command, task.last, task.adds) == (run, "evidence", "evidence.json", True)
 
 
 def test_every_trial_of_a_sweep_is_a_task(submitted, base_run, tmp_path):

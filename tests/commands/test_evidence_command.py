@@ -19,6 +19,8 @@ from forgetmimic_jax.attacks.document import read_evidence
 from forgetmimic_jax.attacks.verdict import RULES, judge
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.settings.config import UnlearnConfig, load_config, save_config
+from forgetmimic_jax.settings.options import parse
+from forgetmimic_jax.studies import executor
 from forgetmimic_jax.tracking.setup import make_setup
 from forgetmimic_jax.training.checkpoint import policy_hash, read_info
 from forgetmimic_jax.unlearning.registry import unlearning_config
@@ -188,3 +190,16 @@ def test_the_fakes_and_another_distilled_policy_are_judged(run, printed, monkeyp
     assert trained["run-lambda-8"] == {"penalty": 8.0, "iterations": 1, "seed": 0}
     assert trained["run-distilled"] == {"method": "distill", "iterations": 1, "seed": 2}
     assert trained["run-control"] == {"method": "distill", "iterations": 1, "seed": 1}
+
+
+def test_every_run_to_attack_is_a_task(run, tmp_path, monkeypatch):
+    runs, where = [shutil.copytree(run, tmp_path / name) for name in ("a", "b")], {"jobs": 3, "cluster": "tcp://a:8786"}
+    given = []
+    monkeypatch.setattr(executor, "run_tasks", lambda tasks, **how: given.append((tasks, how)) or {})
+    one = evidence.Options(run=Path("a"), full=True, recovery_iterations=7)
+    evidence.main(dataclasses.replace(one, run=Path(",".join(map(str, runs))), **where))
+    ((tasks, how),) = given
+    assert {name: how[name] for name in where} == where
+    for folder, task in zip(runs, tasks, strict=True):
+        assert parse(evidence.Options, "evidence", task.flags) == dataclasses.replace(one, run=folder)
+        assert (task.folder, task.command, task.last, task.adds) == (folder, "evidence", "evidence.json", True)

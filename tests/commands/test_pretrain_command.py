@@ -4,16 +4,14 @@ import dataclasses
 from pathlib import Path
 
 import pytest
-from miniature import TINY, finished
+from miniature import TINY
 
 from forgetmimic_jax import pretrain
 from forgetmimic_jax.basics.errors import InputError
-from forgetmimic_jax.evaluation.document import read_evaluation
 from forgetmimic_jax.motion import quality
 from forgetmimic_jax.motion.library import DATA_DIR
 from forgetmimic_jax.settings.config import Config, load_config, preset, save_config
 from forgetmimic_jax.tracking.setup import make_setup
-from forgetmimic_jax.training.checkpoint import BEST, policy_hash, read_info
 
 PHASES = [*TINY, "evaluate_every=4"]
 
@@ -59,19 +57,6 @@ def test_a_control_is_trained_from_nothing_without_its_clips(library_folder, ref
     given = pretrain.Options(library=library_folder, without="turn", base=base)
     message = refused(pretrain.main, given)
     assert message == f"--base: found {base} with --without; accepted: none, since a base may know those clips"
-
-
-def test_it_ends_with_an_evaluation_of_its_best_policy(library_folder, tmp_path):
-    settings = [*PHASES, "evaluate_every=2", "evaluate_episodes=2"]
-    given = {"library": library_folder, "without": "turn", "iterations": 2, "episodes": 2, "set": [settings]}
-    run = finished(pretrain.main, pretrain.Options(**given, output=tmp_path / "run"))
-    best = read_info(run.folder / BEST)
-    document = read_evaluation(run.folder / "evaluation.json")
-    assert (document.episodes, document.targets) == (2, ["turn"])
-    assert document.policy_hashes == {"retrained": policy_hash(best)}
-    assert set(document.policies) == {"retrained", "zero_action"}
-    assert str(run.folder / "evaluation.json") in run.printed
-    assert f"Next: make play ROBOT=g1 CHECKPOINT={best.path}" in run.printed
 
 
 def test_what_the_phases_cannot_work_with_is_told_in_one_line(refused, library_folder):

@@ -83,7 +83,7 @@ def test_an_unknown_clip_is_told(robot, tmp_path):
         recipe.retarget_library(robot, tmp_path, tmp_path / "out", ["backfip"])
 
 
-@pytest.mark.parametrize(("robot_name", "names"), [("g1", "run,kick"), ("h2", "kick")])
+@pytest.mark.parametrize(("robot_name", "names"), [("g1", "run"), ("h2", "kick")])
 def test_shipped_clips_are_made_again(deepmimic, tmp_path, robot_name, names):
     """A cyclic and a single one, by the command: what made the files is in the repository.
 
