@@ -272,6 +272,7 @@ FAMILIES: dict[str, Family] = {
     "pt": _pt,
     "deploy": lambda folder: _policy(folder, "unitree_rl_lab_dance_102/policy.onnx"),
 }
+OF_OTHERS = ("npz", "pickle", "onnx", "deploy")  # families of files in SHARED
 
 
 def flags(rng: random.Random) -> None:

@@ -29,8 +29,8 @@ from typing import Any
 import jax
 import numpy as np
 from commands.miniature import TINY
-from conftest import SWAY_FRAMES, TURN_FRAMES, invented_clip
-from mutations import FAMILIES, half_written
+from conftest import SHARED, SWAY_FRAMES, TURN_FRAMES, invented_clip
+from mutations import FAMILIES, OF_OTHERS, half_written
 
 from forgetmimic_jax.basics.files import read_rows
 from forgetmimic_jax.motion.clip import write_clip
@@ -350,7 +350,9 @@ def main() -> int:
     if "inputs" in parts:
         given.keep.mkdir(parents=True, exist_ok=True)
         for family in (*FAMILIES, "flags", "code"):
-            if not given.only or family in given.only:
+            if family in OF_OTHERS and not SHARED.is_dir():
+                print(f"inputs {family}: left out, since {SHARED} is not there", flush=True)
+            elif not given.only or family in given.only:
                 found[f"inputs {family}"] = faults = inputs(family, given.times, given.keep)
                 print(f"inputs {family}: {given.times} times, {len(faults)} faults", flush=True)
     if "random" in parts:
