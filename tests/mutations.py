@@ -231,15 +231,12 @@ def _state() -> tuple[checkpoint.CheckpointInfo, TrainState]:
 
 
 def _run_part(folder: Path) -> tuple[list[Path], Callable[[], object]]:
-    """The part of a checkpoint from which a run continues; its hashes follow the mutation."""
+    """The part of a checkpoint from which a run continues; its hashes are in the checkpoint's note."""
     info, shapes = _state()
     path = Path(shutil.copytree(info.path, folder / "00000000"))
     files = [file for file in sorted((path / checkpoint.RUN).rglob("*")) if file.is_file()]
 
     def read() -> None:
-        meta = json.loads((path / checkpoint.META).read_text())
-        meta["files"] = {name: file_hash(path / name) for name in meta["files"]}
-        (path / checkpoint.META).write_text(json.dumps(meta))
         checkpoint.load_state(checkpoint.read_info(path), shapes)
 
     return files, read

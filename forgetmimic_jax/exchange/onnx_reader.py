@@ -183,9 +183,10 @@ class _Chain:
 def _linear(node: onnx.NodeProto, constants: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Kernel [in, out] and bias [out]."""
     kernel = constants[0].T if _attribute(node, "transB", 0) else constants[0]
-    kernel = kernel * np.float32(_attribute(node, "alpha", 1.0))
-    bias = constants[1].reshape(-1) * np.float32(_attribute(node, "beta", 1.0)) if len(constants) > 1 else 0.0
-    return kernel, bias + np.zeros(kernel.shape[-1], np.float32)
+    with np.errstate(all="ignore"):  # what is not finite is refused by its name, later
+        kernel = kernel * np.float32(_attribute(node, "alpha", 1.0))
+        bias = constants[1].reshape(-1) * np.float32(_attribute(node, "beta", 1.0)) if len(constants) > 1 else 0.0
+        return kernel, bias + np.zeros(kernel.shape[-1], np.float32)
 
 
 def _attribute(node: onnx.NodeProto, name: str, default: float) -> float:
