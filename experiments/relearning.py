@@ -20,7 +20,16 @@ import numpy as np
 from forgetmimic_jax.basics.files import read_rows
 from forgetmimic_jax.evaluation.document import FILE, read_evaluation
 from forgetmimic_jax.evaluation.plots import new_figure
-from forgetmimic_jax.evaluation.relearning import Lasted, Origin, Origins, at_first, comparable_settings, lasted
+from forgetmimic_jax.evaluation.relearning import (
+    DECISIVE,
+    LEVELS,
+    Lasted,
+    Origin,
+    Origins,
+    at_first,
+    comparable_settings,
+    lasted,
+)
 from forgetmimic_jax.evaluation.repeats import Repeat, over_repeats
 from forgetmimic_jax.evaluation.tables import markdown_table, number, percent
 from forgetmimic_jax.evaluation.verdict import retained, skills
@@ -40,8 +49,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 EVALUATIONS = 20
-SHARES = (0.5, 0.8, 0.95)  # of the base's survival-weighted tracking on the targets
-MAIN_SHARE = 0.8
 CONTROLS = ("distilled", "retrained", "fresh")  # never trained on a target
 HEAD_START = 0.8  # of a level: a control that starts above that says little of how fast it is reached
 
@@ -138,7 +145,7 @@ def body(document: Document) -> str:
     results = document["results"]
     rows = []
     for label in results["starts"]:
-        for level in SHARES:
+        for level in LEVELS:
             found = lasted(results, label, level)
             reached = sum(run.there for run in found.values())
             cells = []
@@ -164,7 +171,7 @@ def body(document: Document) -> str:
 def findings(document: Document) -> Iterator[Finding]:
     """Fig. 8, with the controls that the paper lacks."""
     results = document["results"]
-    for control, level in itertools.product(CONTROLS, SHARES):
+    for control, level in itertools.product(CONTROLS, LEVELS):
         runs = [results["starts"].get(label, {}) for label in ("unlearned", control)]
         if set.intersection(*map(set, runs)):
             yield _no_sooner(results, control, level)
@@ -173,14 +180,14 @@ def findings(document: Document) -> Iterator[Finding]:
 def answer(document: Document) -> str:
     """How much longer the unlearned policy needs, in one sentence."""
     results, parts = document["results"], []
-    mine = lasted(results, "unlearned", MAIN_SHARE)
+    mine = lasted(results, "unlearned", DECISIVE)
     for control in CONTROLS:
-        theirs = lasted(results, control, MAIN_SHARE) if control in results["starts"] else {}
+        theirs = lasted(results, control, DECISIVE) if control in results["starts"] else {}
         if theirs.keys() == mine.keys():
             more = over_repeats({at: mine[at].target_steps - theirs[at].target_steps for at in mine})
             parts.append(f"{number(more, 0)} ({control})")
     return (
-        f"Steps on the targets until {share(MAIN_SHARE)} of the base's tracking, of the unlearned policy minus of one "
+        f"Steps on the targets until {share(DECISIVE)} of the base's tracking, of the unlearned policy minus of one "
         f"that was never trained on them: {'; '.join(parts)}."
     )
 
@@ -201,7 +208,7 @@ def _no_sooner(results: Mapping[str, Any], control: str, level: float) -> Findin
     if head_start >= HEAD_START * level:
         return Finding(claim, "the control starts near it", f"{evidence}, and starts at {share(head_start)}", more["n"])
     differences = {repeat: more_steps(mine[repeat], theirs[repeat]) for repeat in both}
-    main = level == MAIN_SHARE and len(both) == len(mine)
+    main = level == DECISIVE and len(both) == len(mine)
     return finding_between(claim, differences, 0.0, evidence, below=False, main=main)
 
 
@@ -220,7 +227,7 @@ def draw(document: Document) -> Figure:
         for colour, (label, runs) in enumerate(document["results"]["starts"].items()):
             for number_, curve in enumerate(runs.values()):
                 axes.plot(curve[x], curve["tracking"], color=f"C{colour}", label="" if number_ else label)
-        for level in SHARES:
+        for level in LEVELS:
             axes.axhline(level * base, color="0.7", linestyle=":")
         axes.set_xlabel(x.replace("_", " "))
         axes.locator_params(axis="x", nbins=6)

@@ -19,10 +19,10 @@ from forgetmimic_jax.attacks.document import (
     Splices,
 )
 from forgetmimic_jax.attacks.judged import Judged
-from forgetmimic_jax.attacks.relearning import LEVELS
 from forgetmimic_jax.attacks.verdict import RULES, judge, lasted_until
 from forgetmimic_jax.evaluation.document import UnboundedResult
 from forgetmimic_jax.evaluation.metrics import UNLEARNED
+from forgetmimic_jax.evaluation.relearning import LEVELS
 from forgetmimic_jax.evaluation.tables import UNBOUNDED, markdown_table, number, percent
 
 Block = tuple[str, str]  # heading and text

@@ -12,12 +12,9 @@ from forgetmimic_jax.attacks.document import CONTROL, Curve, Relearning
 from forgetmimic_jax.attacks.fine_tuning import shares
 from forgetmimic_jax.attacks.recovery import Workshop
 from forgetmimic_jax.evaluation.metrics import BASE, UNLEARNED
-from forgetmimic_jax.evaluation.relearning import crossing
+from forgetmimic_jax.evaluation.relearning import DECISIVE, LEVELS, crossing
 from forgetmimic_jax.evaluation.verdict import FASTER
 from forgetmimic_jax.policy.policy import Policy
-
-LEVELS = (0.5, 0.8, 0.95)  # of the base's tracking on the targets
-DECISIVE = 0.8  # the level that the verdict compares
 
 FoundOrMade = Callable[[str, Callable[[], Curve]], Curve]  # a curve by name, made where it is not there yet
 

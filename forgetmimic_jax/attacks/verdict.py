@@ -18,7 +18,7 @@ import numpy as np
 from forgetmimic_jax.attacks.document import CONTROL, Compared, EvidenceDocument, Numbers, Relearning
 from forgetmimic_jax.evaluation.document import Estimate
 from forgetmimic_jax.evaluation.metrics import UNLEARNED
-from forgetmimic_jax.evaluation.relearning import Lasted, lasted
+from forgetmimic_jax.evaluation.relearning import DECISIVE, Lasted, lasted
 from forgetmimic_jax.evaluation.tables import FORGOTTEN, KEPT, KEPT_CLIP, number, percent
 from forgetmimic_jax.evaluation.verdict import (
     ALIKE,
@@ -39,7 +39,6 @@ from forgetmimic_jax.evaluation.verdict import (
 )
 
 RECOVERED = 0.1  # above the control, or above the policy before: a recovery of more than this counts
-RELEARNED = 0.8  # of the base's tracking on the targets: the level whose target steps are compared
 
 Marks = Mapping[str, Compared]
 
@@ -64,7 +63,7 @@ RULES = {
         f"Forgotten: {_FORGOTTEN}. Kept: {_KEPT}. Not recovered: fine-tuned on the kept clips alone, its skill and its "
         f"motion content on the targets are at most {RECOVERED:g} above the control's after the same training; with "
         f"other numerics at most {RECOVERED:g} above its own before; and with every seed it needs at least "
-        f"{_bound(FASTER)} of the control's target steps to relearn {_bound(RELEARNED)} of the base's tracking, or "
+        f"{_bound(FASTER)} of the control's target steps to relearn {_bound(DECISIVE)} of the base's tracking, or "
         f"tracks at most {_bound(ALIKE)} of the base's more after the same target steps where neither gets there. All "
         f"of this holds for whole 95 % intervals. The control never rolled out a target clip, and keeps at least "
         f"{_bound(KEPT)} of the kept clips' skill."
@@ -210,7 +209,7 @@ def _pace(relearning: Relearning | None) -> tuple[bool | None, str]:
         ours, theirs = reached(relearning, seed)
         faster.append(ours > theirs + ALIKE)
         short.append(f"{_bound(ours)} against {_bound(theirs)}")
-    words = f"{steps_in_words(pairs)} until {_bound(RELEARNED)} of the base's tracking"
+    words = f"{steps_in_words(pairs)} until {_bound(DECISIVE)} of the base's tracking"
     words += f"; after the same target steps neither got there: {', '.join(short)}" if short else ""
     return pace_over_seeds(faster, words)
 
@@ -228,7 +227,7 @@ def reached(relearning: Relearning, seed: str) -> tuple[float, float]:
 
 def paired(relearning: Relearning) -> dict[str, tuple[Lasted, Lasted]]:
     """By seed, how long the unlearned policy and the control took to relearn the targets."""
-    runs = lasted_until(relearning, RELEARNED)
+    runs = lasted_until(relearning, DECISIVE)
     return {seed: (run, runs[CONTROL][seed]) for seed, run in runs[UNLEARNED].items() if seed in runs[CONTROL]}
 
 

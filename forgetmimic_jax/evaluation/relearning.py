@@ -14,6 +14,8 @@ import msgspec
 from forgetmimic_jax.evaluation.document import Estimate
 from forgetmimic_jax.settings.config import Config, by_name
 
+LEVELS = (0.5, 0.8, 0.95)  # of the base's tracking on the targets
+DECISIVE = 0.8  # the level that verdicts and claims compare
 # Settings that may differ between runs of one kind: names of files, the seed, and how often a run saves and is watched.
 NEUTRAL = (
     *("base", "library", "seed", "checkpoint_every", "evaluate_every", "evaluate_episodes"),

@@ -19,7 +19,7 @@ from forgetmimic_jax.attacks.document import EvidenceDocument, read_evidence
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.evaluation.document import FILE, PolicyResult, read_evaluation
 from forgetmimic_jax.evaluation.metrics import BASE, UNLEARNED
-from forgetmimic_jax.evaluation.relearning import Lasted, Origins, comparable_settings, lasted
+from forgetmimic_jax.evaluation.relearning import DECISIVE, Lasted, Origins, comparable_settings, lasted
 from forgetmimic_jax.evaluation.repeats import base_of
 from forgetmimic_jax.evaluation.tables import KEPT, percent
 from forgetmimic_jax.evaluation.verdict import NO_CONTROL, NO_RELEARNING, NotMeasured, retained, skills
@@ -28,7 +28,6 @@ from forgetmimic_jax.settings.config import load_config
 from forgetmimic_jax.training.checkpoint import policy_hash
 from forgetmimic_jax.unlearning.registry import find_method, method_of, methods
 
-RELEARNED = 0.8  # of the base's tracking on the targets
 # Settings whose difference is named before another's.
 FIRST = ("robot", "unlearn.method", "unlearn.targets", "unlearn.settings.penalty", "iterations", "preset")
 COMPETENT = f"a control needs at least {100 * KEPT:.0f} % of it, with its whole interval"
@@ -110,8 +109,8 @@ def read_relearning(
     try:
         study = json.loads(path.read_text())
         conditions, results = study["conditions"], study["results"]
-        unlearned = lasted(results, "unlearned", RELEARNED)
-        theirs = {start: lasted(results, start, RELEARNED) for start in results["starts"]}
+        unlearned = lasted(results, "unlearned", DECISIVE)
+        theirs = {start: lasted(results, start, DECISIVE) for start in results["starts"]}
         origins = msgspec.convert(results.get("origins"), Origins | None)
     except FileNotFoundError:
         raise InputError(f"{path}: not found") from None

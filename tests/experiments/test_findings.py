@@ -322,7 +322,7 @@ def relearned(unlearned: list[int], distilled: list[int]) -> list:
 )
 def test_what_comes_back_sooner_than_it_is_learned_was_not_forgotten(unlearned, distilled, word):
     found = relearned(unlearned, distilled)
-    assert len(found) == len(relearning.SHARES)
+    assert len(found) == len(relearning.LEVELS)
     assert {one.word for one in found} == {word}
     assert [one.main for one in found] == [False, True, False]
 
