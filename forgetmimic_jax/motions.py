@@ -157,7 +157,8 @@ def import_motion(robot: Robot, options: Import) -> None:
     from forgetmimic_jax.motion.recording import Reading
     from forgetmimic_jax.motion.table import quality_table
 
-    folder, name = options.library or Path("runs") / f"library-{robot.name}", options.name or default_name(options.file)
+    folder = options.library or Path("runs") / f"library-{robot.name}"
+    name = options.name or default_name(options.file.stem)
     library.manifest_for(folder, robot, name, importing.FPS, overwrite=options.force)
     reading = Reading(**{field.name: getattr(options, field.name) for field in fields(Reading)})
     imported = importing.import_motion(robot, options.file, reading, keep_height=options.keep_height)

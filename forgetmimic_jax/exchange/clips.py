@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from forgetmimic_jax.basics.errors import InputError
-from forgetmimic_jax.motion.clip import Clip, validated
+from forgetmimic_jax.motion.clip import Clip, default_name, validated
 from forgetmimic_jax.motion.comparing import BODY_DISTANCE
 from forgetmimic_jax.motion.importing import FPS, import_motion
 from forgetmimic_jax.motion.kinematics import body_motion, configuration, tangent_steps
@@ -26,8 +26,7 @@ FIRST = 25  # frames at the start of a clip that may be garbage: half a second
 def clip_name(policy: Path) -> str:
     """A name for the clip of a policy: that of its file, or of its folder where the file is called policy."""
     folders = [parent.name for parent in policy.resolve().parents if parent.name not in ("exported", "params")]
-    stem = folders[0] if policy.stem in ("policy", "model") and folders else policy.stem
-    return re.sub(r"[^A-Za-z0-9_-]+", "_", stem).strip("_-") or "clip"
+    return default_name(folders[0] if policy.stem in ("policy", "model") and folders else policy.stem)
 
 
 def clip_inside(
@@ -113,8 +112,7 @@ def clip_beside(motion: Path, fps: float | None, robot: Robot) -> Clip:
     """
     said = re.search(r"(\d+) ?(hz|fps)", motion.stem.lower())
     rate = fps or (float(said[1]) if said else None)
-    name = re.sub(r"[^A-Za-z0-9_-]+", "_", motion.stem).strip("_-")
-    return import_motion(robot, motion, Reading(name, rate), keep_height=True).clip
+    return import_motion(robot, motion, Reading(fps=rate), keep_height=True).clip
 
 
 def from_second(clip: Clip, start: float) -> Clip:

@@ -41,9 +41,9 @@ class Clip:
         return self.num_frames / self.fps
 
 
-def default_name(file: Path) -> str:
-    """A clip's name from its file's: other characters than letters, digits, - and _ become _."""
-    return re.sub(r"[^A-Za-z0-9_-]+", "_", file.stem).strip("_-") or "clip"
+def default_name(stem: str) -> str:
+    """A clip's name from a file's or a folder's: other characters than letters, digits, - and _ become _."""
+    return re.sub(r"[^A-Za-z0-9_-]+", "_", stem).strip("_-") or "clip"
 
 
 def validated(clip: Clip, source: str, first: int = 0) -> Clip:

@@ -72,7 +72,7 @@ def read_motion(robot: Robot, path: Path, reading: Reading | None = None) -> Rea
     notes += check_plausible(robot, recording, reading, clip, path)
     check_jumps(clip, first, path)
     notes += spikes(robot, clip, first)
-    return Read(dataclasses.replace(clip, name=reading.name or default_name(path)), tuple(notes))
+    return Read(dataclasses.replace(clip, name=reading.name or default_name(path.stem)), tuple(notes))
 
 
 def _recording(robot: Robot, path: Path) -> Recording:

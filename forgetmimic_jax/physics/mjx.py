@@ -24,6 +24,7 @@ from forgetmimic_jax.physics.engine import (
     select_rows,
 )
 from forgetmimic_jax.robot.model import Robot
+from forgetmimic_jax.settings.config import PhysicsConfig
 
 with contextlib.redirect_stdout(io.StringIO()):  # without warp, the import prints that it is missing
     import mujoco.mjx.warp
@@ -41,7 +42,7 @@ class Room(NamedTuple):
     constraints: int
 
 
-PAPER_ROOM = Room(contacts=35, constraints=250)  # paper, appendix 'Simulation'
+PAPER_ROOM = Room(PhysicsConfig.warp_contacts, PhysicsConfig.warp_constraints)  # the settings' defaults
 
 
 class MjxEngine:

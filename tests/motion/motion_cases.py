@@ -2,10 +2,14 @@
 
 import mujoco
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
+from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.motion.clip import Clip
 from forgetmimic_jax.motion.kinematics import configuration
+from forgetmimic_jax.motion.readers import read_motion
+from forgetmimic_jax.motion.recording import Reading
 
 
 def waving(robot, name, frames, yaw_rate=0.0, fps=50.0):
@@ -27,3 +31,11 @@ def body_positions(robot, clip):
         mujoco.mj_kinematics(robot.model, data)
         found.append(data.xpos[1:].copy())
     return np.array(found)
+
+
+def refusal(robot, path, **options):
+    """The one line with which a file is refused."""
+    with pytest.raises(InputError) as caught:
+        read_motion(robot, path, Reading(**options))
+    assert "\n" not in str(caught.value)
+    return str(caught.value)

@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-from motion_cases import body_positions, waving
+from motion_cases import body_positions, refusal, waving
 
-from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.motion.readers import read_motion
 from forgetmimic_jax.motion.recording import Reading
 
@@ -21,13 +20,6 @@ def fields(robot, clip):
     bodies = body_positions(robot, clip)
     quat = np.tile(clip.root_quat[:, None], (1, bodies.shape[1], 1))
     return {"fps": 50, "joint_pos": clip.joint_pos, "body_pos_w": bodies, "body_quat_w": quat}
-
-
-def refusal(robot, path, **options):
-    with pytest.raises(InputError) as caught:
-        read_motion(robot, path, Reading(**options))
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
 
 
 @pytest.mark.parametrize(

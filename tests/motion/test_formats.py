@@ -4,11 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
-from motion_cases import waving
+from motion_cases import refusal, waving
 from motion_files import LESS, ROOT, clean_rows, write_pickle
 from scipy.spatial.transform import Rotation
 
-from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.motion.clip import write_clip
 from forgetmimic_jax.motion.readers import read_motion
 from forgetmimic_jax.motion.recording import Reading
@@ -33,12 +32,6 @@ def assert_read(robot, path, clip, **options):
     np.testing.assert_allclose(found.clip.joint_pos, clip.joint_pos, atol=1e-7)
     np.testing.assert_allclose(np.abs(np.sum(found.clip.root_quat * clip.root_quat, axis=-1)), 1.0, atol=1e-9)
     return found.notes
-
-
-def refusal(robot, path, **options):
-    with pytest.raises(InputError) as caught:
-        read_motion(robot, path, Reading(**options))
-    return str(caught.value)
 
 
 def test_columns_by_name_in_any_order_with_a_clock(robot, clip, tmp_path):

@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from motion_cases import waving
+from motion_cases import refusal, waving
 from motion_files import ROOT, clean_rows, write_pickle
 
-from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.motion.readers import read_motion
 from forgetmimic_jax.motion.recording import Reading
 
@@ -14,13 +13,6 @@ from forgetmimic_jax.motion.recording import Reading
 def clip(robot):
     """40 frames at 50 Hz of a robot that walks."""
     return waving(robot, "wave", 40)
-
-
-def refusal(robot, path, **options):
-    with pytest.raises(InputError) as caught:
-        read_motion(robot, path, Reading(**options))
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
 
 
 def with_columns(path, robot, clip, columns):

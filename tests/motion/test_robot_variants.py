@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 import yaml
-from motion_cases import body_positions, waving
+from motion_cases import body_positions, refusal, waving
 from motion_files import LESS, ROOT, clean_rows, write_pickle
 
 from forgetmimic_jax.basics.errors import InputError
@@ -36,13 +36,6 @@ def pickled(robot, clip, variant, path):
     """A clip as ASAP, HumanoidVerse and PBHC write them."""
     root = {"root_trans_offset": clip.root_pos, "root_rot": clean_rows(clip)[:, 3:7]}
     return write_pickle(path, {"wave": {**root, "dof": without(robot, clip, variant)[1], "fps": 50}})
-
-
-def refusal(robot, path, **options):
-    with pytest.raises(InputError) as caught:
-        read_motion(robot, path, Reading(**options))
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
 
 
 def assert_joints(robot, clip, variant, found):

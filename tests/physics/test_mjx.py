@@ -200,7 +200,8 @@ def test_warp_step_equals_the_native_engines(warp_result, native_result, capfd):
 
 
 @needs_warp
-def test_warp_says_once_which_room_is_too_small(robot, inputs, native_result, capfd):
+def test_warp_says_once_which_room_is_too_small(robot, inputs, warp_result, native_result, capfd):
+    """`warp_result` has started Warp, which says on a machine without CUDA that it has none."""
     engine = MjxEngine(robot, SUBSTEPS, implementation="warp", room=PAPER_ROOM._replace(constraints=20))
     _say_full.cache_clear()
     step = jax.jit(engine.step)
