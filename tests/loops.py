@@ -21,6 +21,7 @@ import yaml
 from forgetmimic_jax.robot.model import Robot
 from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.tracking.env import Environment, make_assets, make_environment
+from forgetmimic_jax.tracking.rsi import Start
 from forgetmimic_jax.tracking.setup import Setup
 
 KEY = jax.random.PRNGKey(0)
@@ -200,7 +201,7 @@ def in_the_environment(setup: Setup, act: Callable, steps: int, clip: int = 0) -
     observe = jax.jit(lambda assets, state: tracking.observe(env, assets, state, None)[0])
     act = act if isinstance(act, Deployed) else jax.jit(act)
     zeros = jnp.zeros(1, jnp.int32)
-    state = tracking.start_episodes(env, assets, KEY, zeros + clip, zeros, zeros, jnp.zeros(1))
+    state = tracking.start_episodes(env, assets, KEY, Start(zeros + clip, zeros, zeros), jnp.zeros(1))
     state = tracking.refresh_bodies(env, state, jnp.ones(1, bool))
     targets = []
     for _ in range(steps):

@@ -23,6 +23,7 @@ from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.tracking.env import Assets, Environment, EnvState
 from forgetmimic_jax.tracking.reward import Pair
+from forgetmimic_jax.tracking.rsi import Start
 from forgetmimic_jax.tracking.setup import Setup
 
 CHUNK = 50  # control steps between two looks whether every episode has ended
@@ -123,8 +124,8 @@ class Evaluator:
 def begin_episodes(env: Environment, assets: Assets, key: Array, clip: Array, frame: Array) -> EnvState:
     """Episodes [env] at given clips and frames, with reset noise, without the wrench. Bodies: the reference's."""
     zeros = jnp.zeros((env.num_envs,), jnp.int32)
-    clip, frame = clip.astype(jnp.int32), frame.astype(jnp.int32)
-    return tracking.start_episodes(env, assets, key, clip, zeros, frame, zeros.astype(jnp.float32))
+    start = Start(clip.astype(jnp.int32), zeros, frame.astype(jnp.int32))
+    return tracking.start_episodes(env, assets, key, start, zeros.astype(jnp.float32))
 
 
 def act(env: Environment, policy: Acting | None, observation: Array) -> Array:

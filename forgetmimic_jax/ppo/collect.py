@@ -16,7 +16,6 @@ from forgetmimic_jax.ppo.transition import Outcome, Transition
 from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.tracking.env import Assets, Environment
 from forgetmimic_jax.tracking.rsi import episode_failure, sample_start
-from forgetmimic_jax.tracking.wrench import wrench_gain
 
 
 def collect(env: Environment, assets: Assets, state: TrainState, rule: Rule) -> tuple[TrainState, Transition, Outcome]:
@@ -25,8 +24,7 @@ def collect(env: Environment, assets: Assets, state: TrainState, rule: Rule) -> 
     With `branches`, every group of environments starts from the state of its first one.
     """
     config, policy = env.config, state.policy
-    probabilities = tracking.start_probabilities(config, assets, state.failure_level)
-    gains = wrench_gain(config.wrench, state.failure_level)
+    starts = tracking.start_table(config, assets, state.failure_level)
     unknown = jnp.zeros((env.num_envs,))  # the values, until the rollout is over
 
     def observe(episodes: tracking.EnvState, key: Array) -> tuple[Array, Array]:
@@ -39,9 +37,7 @@ def collect(env: Environment, assets: Assets, state: TrainState, rule: Rule) -> 
         mean, log_std = policy.distribution(actor_obs)
         action = mean + jnp.exp(log_std) * jax.random.normal(action_key, mean.shape)
         after, result = tracking.step(env, assets, before, action, step_key)
-        fresh = tracking.reset_where(
-            env, assets, after, result.terminated | result.truncated, reset_key, probabilities, gains
-        )
+        fresh = tracking.reset_where(env, assets, after, result.terminated | result.truncated, reset_key, starts)
         last_critic_obs = tracking.observe(env, assets, after, None)[1]
         reward_key = jax.random.fold_in(key, 4)  # none of the four above
         reward = rule.reward(config, result.reward, assets.is_target[before.clip], reward_key)
@@ -113,13 +109,13 @@ def draw_states(env: Environment, assets: Assets, state: TrainState) -> tuple[Tr
 
     def one_batch(key: Array) -> Transition:
         start_key, episode_key = jax.random.split(key)
-        clip, start_bin, frame = sample_start(config.sampling, start_key, probabilities, assets.bins, env.num_envs)
-        episodes = tracking.start_episodes(env, assets, episode_key, clip, start_bin, frame, no_gain)
+        start = sample_start(config.sampling, start_key, probabilities, assets.bins, env.num_envs)
+        episodes = tracking.start_episodes(env, assets, episode_key, start, no_gain)
         episodes = tracking.refresh_bodies(env, episodes, jnp.ones((env.num_envs,), bool))
         actor_obs, critic_obs = tracking.observe(env, assets, episodes, None)
         mean, log_std = policy.distribution(actor_obs)
         return Transition(
-            actor_obs, critic_obs, action=mean, log_prob=log_prob(mean, mean, log_std), mean=mean, clip=clip
+            actor_obs, critic_obs, action=mean, log_prob=log_prob(mean, mean, log_std), mean=mean, clip=start.clip
         )
 
     key, draw_key = jax.random.split(state.key)

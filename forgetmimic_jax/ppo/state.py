@@ -20,10 +20,9 @@ from forgetmimic_jax.tracking.env import (
     observe,
     reset_where,
     start_episodes,
-    start_probabilities,
+    start_table,
 )
-from forgetmimic_jax.tracking.rsi import initial_failure_level
-from forgetmimic_jax.tracking.wrench import wrench_gain
+from forgetmimic_jax.tracking.rsi import Start, initial_failure_level
 
 
 @struct.dataclass
@@ -62,10 +61,9 @@ def init_state(
     if failure_level is None:
         failure_level = initial_failure_level(config.sampling, assets.bins)
     zeros = jnp.zeros((env.num_envs,), jnp.int32)
-    episodes = start_episodes(env, assets, episode_key, zeros, zeros, zeros, zeros.astype(jnp.float32))
-    probabilities = start_probabilities(config, assets, failure_level)
-    gains = wrench_gain(config.wrench, failure_level)
-    episodes = reset_where(env, assets, episodes, jnp.ones((env.num_envs,), bool), start_key, probabilities, gains)
+    episodes = start_episodes(env, assets, episode_key, Start(zeros, zeros, zeros), zeros.astype(jnp.float32))
+    starts = start_table(config, assets, failure_level)
+    episodes = reset_where(env, assets, episodes, jnp.ones((env.num_envs,), bool), start_key, starts)
     if policy is None:
         actor, critic = observe(env, assets, episodes, None)
         policy = init_policy(config.ppo, env.robot.num_joints, actor.shape[1], critic.shape[1], policy_key)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,11 +28,11 @@ from forgetmimic_jax.tracking.focus import Focus, focus_of
 from forgetmimic_jax.tracking.layouts import Layout, Moment, find_layout
 from forgetmimic_jax.tracking.reference import align_to_anchor, anchor_between, at_anchor, lookup
 from forgetmimic_jax.tracking.reward import Pair
-from forgetmimic_jax.tracking.rsi import Bins, bin_probabilities, make_bins, sample_start
+from forgetmimic_jax.tracking.rsi import Bins, Start, bin_probabilities, make_bins, sample_start
 from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.tracking.stand import falls
 from forgetmimic_jax.tracking.termination import terminations
-from forgetmimic_jax.tracking.wrench import reference_wrench
+from forgetmimic_jax.tracking.wrench import reference_wrench, wrench_gain
 
 
 @struct.dataclass
@@ -66,6 +67,13 @@ class EnvState:
     wrench_gain: Array  # f32 β, frozen for the episode
     push_countdown: Array  # i32 control steps to the next push
     terms: Array  # f32[env, term] kernels of the last step, in the order of `reward.TERMS`
+
+
+class StartTable(NamedTuple):
+    """How new episodes start, by the bin [clip, bin] that they start in."""
+
+    probabilities: Array  # p of starting there, 1 together
+    wrench_gain: Array  # β of such an episode
 
 
 @struct.dataclass
@@ -151,16 +159,20 @@ def start_probabilities(config: Config, assets: Assets, failure_level: Array) ->
     return bin_probabilities(config.sampling, assets.bins, failure_level, assets.is_target, assets.focus.starts)
 
 
-def start_episodes(
-    env: Environment, assets: Assets, key: Array, clip: Array, start_bin: Array, frame: Array, wrench_gain: Array
-) -> EnvState:
-    """Fresh episodes [env] at the given clips and frames, with reset noise. Bodies: see `refresh_bodies`."""
+def start_table(config: Config, assets: Assets, failure_level: Array) -> StartTable:
+    """The table of starts at failure levels L [clip, bin]."""
+    probabilities = start_probabilities(config, assets, failure_level)
+    return StartTable(probabilities, wrench_gain(config.wrench, failure_level))
+
+
+def start_episodes(env: Environment, assets: Assets, key: Array, start: Start, gain: Array) -> EnvState:
+    """Fresh episodes [env] with reset noise and the wrench's gain β [env]. Bodies: see `refresh_bodies`."""
     noise, n, joints = env.config.noise, env.num_envs, env.robot.num_joints
     keys = jax.random.split(key, 4)
-    reference = lookup(assets.library, clip, frame)
-    left = assets.library.length[clip] - 1 - frame
+    reference = lookup(assets.library, start.clip, start.frame)
+    left = assets.library.length[start.clip] - 1 - start.frame
     if env.runs_on:
-        left += env.runs_on * assets.is_target[clip]
+        left += env.runs_on * assets.is_target[start.clip]
     if env.noisy:
         parameters = randomise.physics_parameters(noise, keys[1], n)
         encoder_bias = randomise.symmetric(keys[2], n, (noise.encoder_bias,) * joints)
@@ -171,15 +183,15 @@ def start_episodes(
         physics=randomise.reset_state(noise, assets.robot, reference, env.robot.root, keys[0]),
         bodies=BodyState(**vars(reference.bodies), contact_force=jnp.zeros_like(reference.bodies.pos)),
         parameters=parameters,
-        clip=clip,
-        frame=frame,
-        start_bin=start_bin,
+        clip=start.clip,
+        frame=start.frame,
+        start_bin=start.bin,
         step=jnp.zeros((n,), jnp.int32),
         horizon=jnp.minimum(env.config.max_episode_steps, left),
         tracking_sum=jnp.zeros((n,), jnp.float32),
         last_action=jnp.zeros((n, joints), jnp.float32),
         encoder_bias=encoder_bias,
-        wrench_gain=wrench_gain,
+        wrench_gain=gain,
         push_countdown=randomise.push_interval(noise, keys[3], n, env.control_step),
         terms=jnp.ones((n, len(reward.TERMS)), jnp.float32),
     )
@@ -212,12 +224,12 @@ def refresh_bodies(env: Environment, state: EnvState, mask: Array) -> EnvState:
 
 
 def reset_where(
-    env: Environment, assets: Assets, state: EnvState, mask: Array, key: Array, probabilities: Array, gains: Array
+    env: Environment, assets: Assets, state: EnvState, mask: Array, key: Array, table: StartTable
 ) -> EnvState:
-    """New episodes where mask [env], drawn from `probabilities` [clip, bin] with wrench gains [clip, bin]."""
+    """New episodes where mask [env], at starts that are drawn from a table."""
     start_key, episode_key = jax.random.split(key)
-    clip, start_bin, frame = sample_start(env.config.sampling, start_key, probabilities, assets.bins, env.num_envs)
-    fresh = start_episodes(env, assets, episode_key, clip, start_bin, frame, gains[clip, start_bin])
+    start = sample_start(env.config.sampling, start_key, table.probabilities, assets.bins, env.num_envs)
+    fresh = start_episodes(env, assets, episode_key, start, table.wrench_gain[start.clip, start.bin])
     return refresh_bodies(env, _where(mask, fresh, state), mask)
 
 

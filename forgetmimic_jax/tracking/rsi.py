@@ -5,6 +5,8 @@ Every sampler is a distribution over (clip, bin) with the frame uniform inside t
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,6 +28,14 @@ class Bins:
     start: Array  # i32[clip, bin]
     end: Array  # i32[clip, bin]
     valid: Array  # bool[clip, bin]
+
+
+class Start(NamedTuple):
+    """Where episodes start."""
+
+    clip: Array  # i32[env]
+    bin: Array  # i32[env] of the clip
+    frame: Array  # i32[env]
 
 
 def make_bins(library: MotionLibrary, bin_seconds: float, control_step: float) -> Bins:
@@ -93,10 +103,8 @@ def _by_rule(config: SamplingConfig, bins: Bins, failure_level: Array) -> Array:
     return (1.0 - config.uniform_ratio) * favoured / favoured.sum() + config.uniform_ratio * prior
 
 
-def sample_start(
-    config: SamplingConfig, key: Array, probabilities: Array, bins: Bins, num: int
-) -> tuple[Array, Array, Array]:
-    """Clip, bin and frame, each i32[num]; the config's share of them at the first frame of the clip."""
+def sample_start(config: SamplingConfig, key: Array, probabilities: Array, bins: Bins, num: int) -> Start:
+    """Starts [num]; the config's share of them at the first frame of the clip."""
     bin_key, frame_key = jax.random.split(key)
     # By the inverse of the cumulative distribution: one uniform number a draw, where Gumbel's trick needs one a bin.
     cumulative = jnp.cumsum(probabilities.reshape(-1))
@@ -107,7 +115,7 @@ def sample_start(
     if config.first_frame:
         first = jax.random.bernoulli(jax.random.fold_in(key, 2), config.first_frame, (num,))
         index, frame = jnp.where(first, 0, index), jnp.where(first, 0, frame)
-    return clip.astype(jnp.int32), index.astype(jnp.int32), frame.astype(jnp.int32)
+    return Start(clip.astype(jnp.int32), index.astype(jnp.int32), frame.astype(jnp.int32))
 
 
 def episode_failure(config: SamplingConfig, tracking_sum: Array, steps: Array, horizon: Array) -> Array:

@@ -171,7 +171,6 @@ def roll(
     noisy = (jnp.arange(env.num_envs)[:, None] < config.noise_share * env.num_envs) & (
         state.round < config.noise_rounds
     )
-    no_gain = jnp.zeros_like(teaching.probabilities)
 
     def one_step(carry, key: Array):
         before, noise_key = carry
@@ -181,7 +180,7 @@ def roll(
         action += noisy * config.noise_std * jax.random.normal(action_key, action.shape)
         after, result = tracking.step(env, assets, before, action, step_key)
         done = result.terminated | result.truncated
-        fresh = tracking.reset_where(env, assets, after, done, reset_key, teaching.probabilities, no_gain)
+        fresh = tracking.reset_where(env, assets, after, done, reset_key, teaching.starts)
         reward = (result.reward.tracking + result.reward.regularisation) * env.control_step
         value = state.student.value(critic_obs)
         next_value = state.student.value(tracking.observe(env, assets, after, None)[1])

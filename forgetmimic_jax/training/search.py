@@ -25,6 +25,7 @@ from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.ppo.gae import generalized_advantages
 from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.tracking.env import Assets, Environment, EnvState
+from forgetmimic_jax.tracking.rsi import Start
 from forgetmimic_jax.training.teaching import Lesson
 
 
@@ -155,7 +156,8 @@ def _start(env: Environment, assets: Assets, clip: int | np.ndarray, frame: int,
     scaled = dataclasses.replace(env.config.noise, **jax.tree.map(lambda width: noise * width, widths))
     env = dataclasses.replace(env, config=dataclasses.replace(env.config, noise=scaled))
     zeros = jnp.zeros((env.num_envs,), jnp.int32)
-    state = tracking.start_episodes(env, assets, key, zeros + clip, zeros, zeros + frame, zeros.astype(jnp.float32))
+    start = Start(zeros + clip, zeros, zeros + frame)
+    state = tracking.start_episodes(env, assets, key, start, zeros.astype(jnp.float32))
     return tracking.refresh_bodies(env, state, zeros == 0)
 
 

@@ -155,14 +155,14 @@ def _environment_alone(env: tracking.Environment) -> Callable:
     @jax.jit
     def environment(assets, episodes, failure_level, key):
         probabilities = tracking.start_probabilities(config, assets, failure_level)
-        gains = jnp.zeros_like(probabilities)
+        starts = tracking.StartTable(probabilities, jnp.zeros_like(probabilities))
 
         def one_step(episodes, key):
             action_key, step_key, reset_key, observe_key = jax.random.split(key, 4)
             action = config.ppo.initial_std * jax.random.normal(action_key, (env.num_envs, env.robot.num_joints))
             after, result = tracking.step(env, assets, episodes, action, step_key)
             done = result.terminated | result.truncated
-            fresh = tracking.reset_where(env, assets, after, done, reset_key, probabilities, gains)
+            fresh = tracking.reset_where(env, assets, after, done, reset_key, starts)
             observation = tracking.observe(env, assets, fresh, observe_key)
             reference = tracking.lookup(assets.library, episodes.clip, episodes.frame + 1)
             joint_target = to_joint_target(config.action.mode, assets.robot, reference, action)

@@ -12,7 +12,8 @@ from jax import Array
 
 from forgetmimic_jax.evaluation.rollout import Acting
 from forgetmimic_jax.tracking import env as tracking
-from forgetmimic_jax.tracking.env import Assets, Environment, EnvState
+from forgetmimic_jax.tracking.env import Assets, Environment, EnvState, StartTable
+from forgetmimic_jax.tracking.rsi import Start
 
 
 class Teacher(Protocol):
@@ -59,6 +60,11 @@ class Teaching:
     probabilities: Array  # [clip, bin] of the starts of episodes
     shown: Lesson | None = None  # [n] joins the lessons of every round, such as what a search found
 
+    @property
+    def starts(self) -> StartTable:
+        """Where episodes start, without the assistive wrench."""
+        return StartTable(self.probabilities, jnp.zeros_like(self.probabilities))
+
 
 def make_teaching(
     assets: Assets, taught: Sequence[tuple[Teacher, Sequence[int]]], shown: Lesson | None = None
@@ -97,9 +103,8 @@ def lesson_at(
 
 
 def fresh_episodes(env: Environment, assets: Assets, teaching: Teaching, key: Array) -> EnvState:
-    """Every robot at a start of an episode, with reset noise and without the assistive wrench."""
+    """Every robot at a start of an episode, with reset noise."""
     episode_key, start_key = jax.random.split(key)
     zeros = jnp.zeros((env.num_envs,), jnp.int32)
-    blank = tracking.start_episodes(env, assets, episode_key, zeros, zeros, zeros, zeros.astype(jnp.float32))
-    everywhere, no_gain = jnp.ones((env.num_envs,), bool), jnp.zeros_like(teaching.probabilities)
-    return tracking.reset_where(env, assets, blank, everywhere, start_key, teaching.probabilities, no_gain)
+    blank = tracking.start_episodes(env, assets, episode_key, Start(zeros, zeros, zeros), zeros.astype(jnp.float32))
+    return tracking.reset_where(env, assets, blank, jnp.ones((env.num_envs,), bool), start_key, teaching.starts)

@@ -16,6 +16,7 @@ from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.tracking.action import to_action
 from forgetmimic_jax.tracking.env import Environment, make_assets
 from forgetmimic_jax.tracking.layouts import LAYOUTS
+from forgetmimic_jax.tracking.rsi import Start
 from forgetmimic_jax.tracking.setup import Setup, make_setup
 
 KEY = jax.random.PRNGKey(0)
@@ -48,7 +49,7 @@ def step(request, robot, library, tiny_config, mode):
 
     def step(output: dict[str, float], bias: float = 0.0):
         clip, frame, gain = jnp.array([CLIP]), jnp.array([FRAME]), jnp.zeros(1)
-        state = tracking.start_episodes(env, assets, KEY, clip, clip, frame, gain)
+        state = tracking.start_episodes(env, assets, KEY, Start(clip, clip, frame), gain)
         state = dataclasses.replace(state, encoder_bias=jnp.full((1, 29), bias))
         sent["bodies"] = state.bodies
         raw = np.array([output.get(name, 0.0) for name in order or robot.joint_names], np.float32)

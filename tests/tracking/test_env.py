@@ -13,8 +13,9 @@ from forgetmimic_jax.physics import BodyState, PhysicsParameters, PhysicsState
 from forgetmimic_jax.robot.bodies import Bodies
 from forgetmimic_jax.settings.config import Config
 from forgetmimic_jax.tracking import env as tracking
-from forgetmimic_jax.tracking.env import Environment, EnvState, make_assets, make_environment
+from forgetmimic_jax.tracking.env import Environment, EnvState, StartTable, make_assets, make_environment
 from forgetmimic_jax.tracking.reference import lookup
+from forgetmimic_jax.tracking.rsi import Start
 from forgetmimic_jax.tracking.setup import Setup
 
 ENVS = 4
@@ -61,7 +62,7 @@ def start(env: Environment, assets, clip: list[int], frame: list[int], gain: flo
     """Episodes at the frames given, exactly on the reference."""
     clip_, frame_ = jnp.asarray(clip, jnp.int32), jnp.asarray(frame, jnp.int32)
     gains = jnp.full(ENVS, gain, jnp.float32)
-    state = tracking.start_episodes(env, assets, KEY, clip_, jnp.zeros_like(clip_), frame_, gains)
+    state = tracking.start_episodes(env, assets, KEY, Start(clip_, jnp.zeros_like(clip_), frame_), gains)
     physics, bodies = on_frame(env, assets, clip_, frame_)
     return dataclasses.replace(state, physics=physics, bodies=bodies)
 
@@ -380,7 +381,8 @@ def test_the_wrench_carries_the_robot_and_does_not_tear_it_apart(robot, tiny_con
         setup = Setup(config, robot, library, "")
         env, assets = make_environment(setup, envs), make_assets(setup)
         zeros = jnp.zeros((envs,), jnp.int32)
-        state = tracking.start_episodes(env, assets, KEY, zeros, zeros, jnp.arange(envs), jnp.full(envs, gain))
+        begin = Start(zeros, zeros, jnp.arange(envs))
+        state = tracking.start_episodes(env, assets, KEY, begin, jnp.full(envs, gain))
         state = tracking.refresh_bodies(env, state, jnp.ones(envs, bool))
         advance = jax.jit(lambda assets, state, key, env=env: tracking.step(
             env, assets, state, jnp.zeros((envs, robot.num_joints)), key))  # fmt: skip
@@ -431,7 +433,7 @@ def test_resets_start_new_episodes_where_asked_and_only_there(puppet_env, assets
     mask = jnp.array([True, False, True, False])
     one_bin = jnp.zeros(assets.bins.valid.shape).at[1, 1].set(1.0)
     gains = jnp.zeros(assets.bins.valid.shape).at[1, 1].set(0.4)
-    after = tracking.reset_where(puppet_env, assets, state, mask, KEY, one_bin, gains)
+    after = tracking.reset_where(puppet_env, assets, state, mask, KEY, StartTable(one_bin, gains))
     for old, new in zip(jax.tree.leaves(state), jax.tree.leaves(after), strict=True):
         np.testing.assert_array_equal(np.asarray(old)[1::2], np.asarray(new)[1::2])
     np.testing.assert_array_equal(after.clip[::2], 1)
@@ -495,9 +497,8 @@ def test_a_diverged_robot_is_whole_again_after_its_reset(native, assets):
     env, step = native
     state = poisoned(start(env, assets, [0] * ENVS, [0] * ENVS), "nan")
     after, result = step(state, jnp.zeros((ENVS, 29)))
-    shape = assets.bins.valid.shape
     uniform = assets.bins.valid / assets.bins.valid.sum()
-    fresh = tracking.reset_where(env, assets, after, result.terminated, KEY, uniform, jnp.zeros(shape))
+    fresh = tracking.reset_where(env, assets, after, result.terminated, KEY, StartTable(uniform, 0.0 * uniform))
     for leaf in jax.tree.leaves((fresh, tracking.observe(env, assets, fresh, KEY))):
         assert np.isfinite(leaf).all()
 

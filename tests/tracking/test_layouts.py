@@ -19,6 +19,7 @@ from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.tracking.env import Environment, make_assets
 from forgetmimic_jax.tracking.layouts import LAYOUTS, Moment, find_layout
 from forgetmimic_jax.tracking.observation import actor_observation, critic_size, sensor_noise
+from forgetmimic_jax.tracking.rsi import Start
 from forgetmimic_jax.tracking.setup import Setup, make_setup
 
 # Terms with their sizes and half-widths of noise.
@@ -285,7 +286,7 @@ def observed(robot, library, tiny_config, layout):
     assets = make_assets(Setup(config, robot, library, ""))
     env = Environment(config, robot, None, 3, noisy=False)  # nothing moves, so no engine is needed
     clip, frame = jnp.full(3, 1), jnp.array([0, 7, 39])
-    state = tracking.start_episodes(env, assets, jax.random.PRNGKey(0), clip, clip, frame, jnp.zeros(3))
+    state = tracking.start_episodes(env, assets, jax.random.PRNGKey(0), Start(clip, clip, frame), jnp.zeros(3))
     state = dataclasses.replace(state, encoder_bias=jnp.full((3, 29), 0.01))
     clean, critic = tracking.observe(env, assets, state, None)
     noisy, _ = tracking.observe(env, assets, state, jax.random.PRNGKey(1))

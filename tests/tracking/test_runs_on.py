@@ -14,6 +14,7 @@ from forgetmimic_jax.settings.config import UnlearnConfig
 from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.tracking.env import Environment, make_assets, make_environment
 from forgetmimic_jax.tracking.reference import lookup
+from forgetmimic_jax.tracking.rsi import Start
 from forgetmimic_jax.tracking.setup import Setup
 
 KEY = jax.random.PRNGKey(0)
@@ -28,7 +29,7 @@ def setup(robot, library, tiny_config) -> Setup:
 
 def begin(env: Environment, assets, frame: int):
     clips, frames = jnp.array([SWAY, TURN]), jnp.full(2, frame)
-    return tracking.start_episodes(env, assets, KEY, clips, jnp.zeros(2, jnp.int32), frames, jnp.zeros(2))
+    return tracking.start_episodes(env, assets, KEY, Start(clips, jnp.zeros(2, jnp.int32), frames), jnp.zeros(2))
 
 
 def test_a_target_s_episode_lasts_3_s_longer_than_the_clip(setup):

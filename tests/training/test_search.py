@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.tracking.reference import lookup
+from forgetmimic_jax.tracking.rsi import Start
 from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.training.search import SearchConfig, first_failures, search, straight_lines
 from forgetmimic_jax.training.start import fresh_policy
@@ -60,9 +61,8 @@ def survived(env, assets, policy):
 
     def count(clip: int, frame: int, added: np.ndarray) -> int:
         clips, frames = jnp.full(ROLLOUTS, clip, jnp.int32), jnp.full(ROLLOUTS, frame, jnp.int32)
-        state = tracking.start_episodes(
-            env, assets, jax.random.PRNGKey(0), clips, 0 * clips, frames, jnp.zeros(ROLLOUTS)
-        )
+        start = Start(clips, 0 * clips, frames)
+        state = tracking.start_episodes(env, assets, jax.random.PRNGKey(0), start, jnp.zeros(ROLLOUTS))
         reference, root = lookup(assets.library, clips, frames), env.robot.root
         quat = np.asarray(reference.bodies.quat[:, root])
         spin = Rotation.from_quat(quat, scalar_first=True).inv().apply(np.asarray(reference.bodies.ang_vel[:, root]))

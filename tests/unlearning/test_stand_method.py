@@ -18,6 +18,7 @@ from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.tracking.env import Assets, Environment, EnvState, make_assets
 from forgetmimic_jax.tracking.layouts import LAYOUTS
 from forgetmimic_jax.tracking.observation import actor_observation
+from forgetmimic_jax.tracking.rsi import Start
 from forgetmimic_jax.tracking.setup import Setup, instead_of_targets
 from forgetmimic_jax.tracking.stand import stand_frame, stand_library
 from forgetmimic_jax.unlearning.stand import taught_action, teacher_moment
@@ -52,7 +53,7 @@ def puppet(setup: Setup, physics, bodies, seen: list) -> Environment:
 
 def started(env: Environment, assets: Assets, clip: int, frame: int) -> EnvState:
     clip_, frame_ = jnp.array([clip]), jnp.array([frame])
-    return tracking.start_episodes(env, assets, KEY, clip_, jnp.array([0]), frame_, jnp.zeros(1))
+    return tracking.start_episodes(env, assets, KEY, Start(clip_, jnp.array([0]), frame_), jnp.zeros(1))
 
 
 def leaning(robot: Robot, yaw: float, place: tuple[float, float]) -> tuple:
