@@ -273,10 +273,9 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
     # A diverged robot shows as standing where it was, so that no NaN can reach a sum; it is reset right after.
     physics, bodies = (_where(diverged, old, new) for old, new in ((state.physics, physics), (state.bodies, bodies)))
 
-    joint_pos, joint_vel = physics.qpos[:, 7:], physics.qvel[:, 6:]
     reference = reference_of(env, assets, dataclasses.replace(state, bodies=bodies), ahead=1)
     aligned = align_to_anchor(reference, robot.anchor, bodies.pos[:, robot.anchor], bodies.quat[:, robot.anchor])
-    pair = Pair(reference, aligned, bodies, joint_pos, joint_vel, robot.anchor)
+    pair = Pair(reference, aligned, bodies, physics.qpos[:, 7:], physics.qvel[:, 6:], robot.anchor)
     kernels = reward.tracking_kernels(pair)
     tracking, normalized = reward.tracking_reward(kernels, config.reward)
     regularisation = reward.regularisation_reward(
@@ -284,10 +283,8 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
         config.reward,
         action=action,
         last_action=state.last_action,
-        joint_pos=joint_pos,
-        joint_vel=joint_vel,
-        joint_acc=physics.warmstart[:, 6:],
         joint_target=joint_target,
+        physics=physics,
     )
     # Where, not a product: a number that overflowed before the divergence was seen would survive a factor of zero.
     result_reward = jax.tree.map(

@@ -15,7 +15,7 @@ from jax import Array
 
 from forgetmimic_jax.basics import rotation
 from forgetmimic_jax.motion.library import Frames
-from forgetmimic_jax.physics import BodyState
+from forgetmimic_jax.physics import BodyState, PhysicsState
 from forgetmimic_jax.robot.model import RobotArrays
 from forgetmimic_jax.settings.config import RewardConfig
 from forgetmimic_jax.tracking.reference import AlignedBodies
@@ -115,10 +115,8 @@ def regularisation_reward(
     *,
     action: Array,
     last_action: Array,
-    joint_pos: Array,
-    joint_vel: Array,
-    joint_acc: Array,
     joint_target: Array,
+    physics: PhysicsState,
 ) -> Array:
     """R_reg [env] (paper, 'Regularization Rewards').
 
@@ -127,11 +125,10 @@ def regularisation_reward(
         config: weights.
         action: [env, joint] this step's.
         last_action: [env, joint] the step before.
-        joint_pos: [env, joint] rad, after the step.
-        joint_vel: [env, joint] rad/s, after the step.
-        joint_acc: [env, joint] rad/s².
         joint_target: [env, joint] rad, of the PD loops in this step.
+        physics: after the step.
     """
+    joint_pos, joint_vel, joint_acc = physics.qpos[:, 7:], physics.qvel[:, 6:], physics.warmstart[:, 6:]
     torque = jnp.clip(
         robot.stiffness * (joint_target - joint_pos) - robot.damping * joint_vel, -robot.effort, robot.effort
     )

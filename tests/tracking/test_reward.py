@@ -8,6 +8,7 @@ import pytest
 from scene import on_reference, shaken, turned, upright_scene
 from scipy.spatial.transform import Rotation
 
+from forgetmimic_jax.physics import PhysicsState
 from forgetmimic_jax.settings.config import RewardConfig
 from forgetmimic_jax.tracking.reference import align_to_anchor, lookup
 from forgetmimic_jax.tracking.reward import (
@@ -206,13 +207,16 @@ def test_a_term_of_weight_zero_has_a_kernel_but_no_part_in_the_reward():
 
 
 def regularisation(robot, config=RewardConfig(), **changes) -> float:  # noqa: B008 (a frozen dataclass)
-    """R_reg of a robot at rest in its default pose, with the arguments given changed."""
+    """R_reg of a robot at rest in its default pose, with the values given changed."""
     still = jnp.zeros((1, robot.num_joints))
     default = robot.arrays.default_joint_pos[None]
-    arguments = dict(
+    values = dict(
         action=still, last_action=still, joint_pos=default, joint_vel=still, joint_acc=still, joint_target=default
     )
-    return float(regularisation_reward(robot.arrays, config, **arguments | changes)[0])
+    values |= changes
+    joints, roots = [values.pop(name) for name in ("joint_pos", "joint_vel", "joint_acc")], (7, 6, 6)
+    physics = PhysicsState(*(jnp.pad(x, ((0, 0), (root, 0))) for x, root in zip(joints, roots, strict=True)))
+    return float(regularisation_reward(robot.arrays, config, physics=physics, **values)[0])
 
 
 def test_a_robot_at_rest_gets_the_survival_bonus_alone(robot):
