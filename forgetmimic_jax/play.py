@@ -37,14 +37,11 @@ def main(options: Options) -> None:
         raise InputError(f"--port: found {options.port}; accepted: 1024 to 65535")
     check_host(options.host)
     compared = options.load()
-    robot, library = compared.setup.robot, compared.setup.library
     stage = SideBySide(compared.setup, compared.policies)
-    first = library.names.index(compared.targets[0]) if compared.targets else 0
-    playback = Playback(stage, robot, first, seed=options.seed)
+    first = stage.library.names.index(compared.targets[0]) if compared.targets else 0
+    playback = Playback(stage, first, seed=options.seed)
     playback.advance()  # compiles
-    server = Server(
-        stage, robot, compared.targets, first=first, seed=options.seed, host=options.host, port=options.port
-    )
+    server = Server(stage, compared.targets, first=first, seed=options.seed, host=options.host, port=options.port)
     Console().print(f"Open {server.address} in a browser; Ctrl-C ends it.", highlight=False)
     with contextlib.closing(server), contextlib.suppress(KeyboardInterrupt):
         server.wait()

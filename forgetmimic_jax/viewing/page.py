@@ -13,7 +13,7 @@ import numpy.typing as npt
 import viser
 from scipy.spatial.transform import Rotation
 
-from forgetmimic_jax.robot.model import Robot, relative_height
+from forgetmimic_jax.robot.model import relative_height
 from forgetmimic_jax.viewing.playback import Playback
 from forgetmimic_jax.viewing.shapes import UNIT_MESHES, Shapes
 from forgetmimic_jax.viewing.takes import in_words
@@ -36,10 +36,7 @@ class Page:
         self,
         client: viser.ClientHandle | viser.ViserServer,
         playback: Playback,
-        robot: Robot,
         drawn: Mapping[str, Shapes],
-        policies: Sequence[str],
-        clips: Sequence[str],
         targets: Sequence[str],
     ):
         """Fill the page.
@@ -47,17 +44,15 @@ class Page:
         Args:
             client: the browser; a server stands for all of its browsers.
             playback: what the page shows.
-            robot: of the playback.
             drawn: the robot's shapes to be seen.
-            policies: names of the playback's policies.
-            clips: names of the library's clips.
             targets: clips to forget.
         """
-        self._client, self._playback, self._policies = client, playback, list(policies)
-        self._model, self._data = robot.model, mujoco.MjData(robot.model)
+        self._client, self._playback, self._policies = client, playback, playback.policies
+        self._model, self._data = playback.robot.model, mujoco.MjData(playback.robot.model)
         self._todo: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()  # what the page's visitor wants done
         self._random = np.random.default_rng()
         self._playing, self._due = True, time.monotonic()
+        clips = playback.clips
         self._targets = {clips.index(target) for target in targets}
         self._menu = {f"{clip} (to be forgotten)" if clip in targets else clip: i for i, clip in enumerate(clips)}
         self._build_scene(drawn)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from forgetmimic_jax.evaluation.side_by_side import SideBySide, push
-from forgetmimic_jax.robot.model import Robot
 from forgetmimic_jax.viewing.takes import reference_qpos
 
 
@@ -15,8 +14,9 @@ class Playback:
     It runs on after a bound was broken, and for some seconds after the clip's end with the last frame held.
     """
 
-    def __init__(self, stage: SideBySide, robot: Robot, clip: int = 0, *, seed: int = 0):
-        self._stage, self._robot, self._seed = stage, robot, seed
+    def __init__(self, stage: SideBySide, clip: int = 0, *, seed: int = 0):
+        self._stage, self._seed = stage, seed
+        self.robot, self.policies, self.clips = stage.env.robot, stage.names, stage.library.names
         self.control_step = stage.env.control_step
         self.begin(clip)
 
@@ -24,14 +24,14 @@ class Playback:
         """Go to the start of `clip`."""
         self.clip = clip
         self._state = self._stage.begin([clip], [0], self._seed)
-        self._reference = reference_qpos(self._robot, self._stage.library, clip)
+        self._reference = reference_qpos(self.robot, self._stage.library, clip)
         self.horizon = int(self._state.horizon[0])
         self.last_step = self.horizon + self._stage.hold
         self.step = 0
         self.qpos = np.asarray(self._state.physics.qpos)  # [policy, nq]
-        self.ended: list[int | None] = [None] * len(self._stage.names)  # steps before a bound was broken
-        self.fell: list[int | None] = [None] * len(self._stage.names)  # steps to the first fall
-        self.impact = np.zeros(len(self._stage.names))  # body weights, the largest on a body that is no foot
+        self.ended: list[int | None] = [None] * len(self.policies)  # steps before a bound was broken
+        self.fell: list[int | None] = [None] * len(self.policies)  # steps to the first fall
+        self.impact = np.zeros(len(self.policies))  # body weights, the largest on a body that is no foot
         self.tracking: list[np.ndarray] = []  # [step][policy] r̄, zero after the end
         self.height = [self._heights()]  # [step + 1][policy and reference] of the root, m
 

@@ -15,7 +15,7 @@ import viser
 
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.evaluation.side_by_side import SideBySide
-from forgetmimic_jax.robot.model import Robot, relative_height
+from forgetmimic_jax.robot.model import relative_height
 from forgetmimic_jax.viewing.offscreen import drawing_model
 from forgetmimic_jax.viewing.page import Page
 from forgetmimic_jax.viewing.playback import Playback
@@ -30,7 +30,6 @@ class Server:
     def __init__(
         self,
         stage: SideBySide,
-        robot: Robot,
         targets: Sequence[str],
         *,
         first: int = 0,
@@ -42,23 +41,21 @@ class Server:
 
         Args:
             stage: of the policies.
-            robot: theirs.
             targets: clips to forget.
             first: the clip that a page begins with.
             seed: of the reset noise.
             host: address of this machine to be reached at, see `check_host`; LOCALHOST: only from this machine.
             port: of the page; the next free one if it is taken.
         """
-        self._stage, self._robot, self._targets = stage, robot, targets
-        self._first, self._seed = first, seed
-        self._shapes = shapes(drawing_model(robot.name, 16, 16))
+        self._stage, self._targets, self._first, self._seed = stage, targets, first, seed
+        self._shapes = shapes(drawing_model(stage.env.robot.name, 16, 16))
         self._turn = threading.Lock()  # to simulate: a stage serves one thread at a time
         self._visits: dict[int, tuple[threading.Thread, threading.Event]] = {}
         with contextlib.redirect_stdout(io.StringIO()):  # viser's own announcement
             self._server = viser.ViserServer(host=host, port=port, label="ForgetMimic", verbose=False)
         name = socket.gethostname() if host in EVERYWHERE else host
         self.address = f"http://{f'[{name}]' if ':' in name else name}:{self._server.get_port()}"
-        size = relative_height(robot.model)
+        size = relative_height(stage.env.robot.model)
         camera = self._server.initial_camera
         camera.position, camera.look_at = size * np.array([3.4, -0.9, 1.5]), size * np.array([0.0, 0.0, 0.62])
         self._server.scene.set_background_image(np.full((1, 1, 3), 244, np.uint8))
@@ -98,10 +95,8 @@ class Server:
 
     def _play(self, client: viser.ClientHandle, gone: threading.Event) -> None:
         with self._turn:
-            playback = Playback(self._stage, self._robot, self._first, seed=self._seed)
-        names, clips = self._stage.names, self._stage.library.names
-        page = Page(client, playback, self._robot, self._shapes, names, clips, self._targets)
-        page.run(gone, self._turn)
+            playback = Playback(self._stage, self._first, seed=self._seed)
+        Page(client, playback, self._shapes, self._targets).run(gone, self._turn)
 
 
 def check_host(host: str) -> None:

@@ -44,15 +44,15 @@ def drawn(robot):
 
 
 @pytest.fixture
-def page(stage, robot, library, drawn):
+def page(stage, drawn):
     everybody = viser.ViserServer(host="127.0.0.1", port=18080, verbose=False)
-    yield Page(everybody, Playback(stage, robot), robot, drawn, stage.names, library.names, ["turn"])
+    yield Page(everybody, Playback(stage), drawn, ["turn"])
     everybody.stop()
 
 
 @pytest.fixture
-def server(stage, robot):
-    with contextlib.closing(Server(stage, robot, ["turn"], port=18090)) as server:
+def server(stage):
+    with contextlib.closing(Server(stage, ["turn"], port=18090)) as server:
         yield server
 
 
@@ -213,11 +213,11 @@ def test_each_browser_has_a_simulation_and_one_that_vanishes_ends_its_own(server
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the address 127.0.0.2 is Linux's")
-def test_it_is_served_to_this_machine_alone_unless_a_host_is_given(server, stage, robot):
+def test_it_is_served_to_this_machine_alone_unless_a_host_is_given(server, stage):
     assert server.address == "http://127.0.0.1:18090"
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.2", 18090), timeout=60.0)
-    with contextlib.closing(Server(stage, robot, [], host="0.0.0.0", port=18095)) as public:
+    with contextlib.closing(Server(stage, [], host="0.0.0.0", port=18095)) as public:
         socket.create_connection(("127.0.0.2", 18095), timeout=60.0).close()
         assert public.address == f"http://{socket.gethostname()}:18095"
 

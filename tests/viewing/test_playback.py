@@ -15,8 +15,8 @@ def stage(tiny_setup, policy) -> SideBySide:
 
 
 @pytest.fixture
-def playback(stage, robot) -> Playback:
-    return Playback(stage, robot, clip=1, seed=3)
+def playback(stage) -> Playback:
+    return Playback(stage, clip=1, seed=3)
 
 
 def test_it_shows_the_episode_that_a_film_of_the_same_start_shows(playback, library, tiny_setup, policy):
@@ -50,8 +50,8 @@ def test_it_stops_3_s_after_the_clips_end_and_begins_again_where_it_began(playba
     assert (playback.clip, playback.horizon) == (0, 79)
 
 
-def test_a_push_moves_every_robot_the_same_way(stage, robot, playback):
-    pushed = Playback(stage, robot, clip=1, seed=3)
+def test_a_push_moves_every_robot_the_same_way(stage, playback):
+    pushed = Playback(stage, clip=1, seed=3)
     pushed.push(np.array([2.0, 0.0, 0.0]))
     playback.advance()
     pushed.advance()
