@@ -6,7 +6,7 @@ from forgetmimic_jax.attacks.case import Case
 from forgetmimic_jax.attacks.document import CONTROL, Recovery
 from forgetmimic_jax.attacks.fine_tuning import shares
 from forgetmimic_jax.attacks.near_duplicates import first_half, second_half
-from forgetmimic_jax.attacks.recovery import Workshop, before_and_after
+from forgetmimic_jax.attacks.recovery import Plan, Workshop, before_and_after
 from forgetmimic_jax.evaluation.metrics import UNLEARNED
 from forgetmimic_jax.motion.clip import Clip
 
@@ -20,7 +20,5 @@ def attack(case: Case, workshop: Workshop) -> Recovery:
     """Unlearned policy and control on the second halves, before and after; half of the starts are on first halves."""
     stage = case.stage([second_half(clip) for clip in case.chosen(case.targets)], case.scale.target_episodes)
     starts = shares([clip.name for clip in shown(case)], case.kept)
-    before = stage, stage.perform(case.everyone)
-    return before_and_after(
-        case, workshop, "held-out", before, starts, case.scale.held_out_iterations, (UNLEARNED, CONTROL)
-    )
+    plan = Plan("held-out", (UNLEARNED, CONTROL), starts, case.scale.held_out_iterations)
+    return before_and_after(case, workshop, plan, stage, stage.perform(case.everyone))

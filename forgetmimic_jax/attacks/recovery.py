@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,6 +18,22 @@ from forgetmimic_jax.attacks.performance import Performance, compare, over_seeds
 from forgetmimic_jax.attacks.rollouts import Stage
 from forgetmimic_jax.evaluation.metrics import UNLEARNED
 from forgetmimic_jax.policy.policy import Policy
+
+
+class Plan(NamedTuple):
+    """What an attack trains.
+
+    Args:
+        name: of the training.
+        policies: names of those that train, with unlearned and control.
+        starts: share of the starts of each clip.
+        iterations: of PPO.
+    """
+
+    name: str
+    policies: Sequence[str]
+    starts: Mapping[str, float]
+    iterations: int
 
 
 @dataclass(frozen=True)
@@ -36,32 +53,21 @@ class Workshop:
 
 def attack(case: Case, workshop: Workshop) -> Recovery:
     """Every policy on the targets, before and after it trained on the kept clips."""
-    before, starts = (case.target_stage, case.on_targets), shares([], case.kept)
-    return before_and_after(case, workshop, "recovered", before, starts, case.scale.recovery_iterations, TRAINED)
+    plan = Plan("recovered", TRAINED, shares([], case.kept), case.scale.recovery_iterations)
+    return before_and_after(case, workshop, plan, case.target_stage, case.on_targets)
 
 
-def before_and_after(
-    case: Case,
-    workshop: Workshop,
-    name: str,
-    before: tuple[Stage, Performance],
-    starts: Mapping[str, float],
-    iterations: int,
-    policies: Sequence[str],
-) -> Recovery:
+def before_and_after(case: Case, workshop: Workshop, plan: Plan, stage: Stage, before: Performance) -> Recovery:
     """Policies before and after a training; with several seeds the seed is the unit.
 
     Args:
         case: whose policies they are.
         workshop: to train with.
-        name: of the training.
-        before: episodes, and how everyone did in them.
-        starts: share of the training's starts of each clip.
-        iterations: of the training.
-        policies: names of those that train, with unlearned and control.
+        plan: what is trained.
+        stage: the episodes.
+        before: how everyone did in them.
     """
-    stage, performance = before
-    every = np.ones(len(performance.clip), bool)
+    every = np.ones(len(before.clip), bool)
 
     def trained(policy: str, seed: int) -> Policy:
         start = case.policies[policy]
@@ -72,19 +78,19 @@ def before_and_after(
             return False
 
         def train() -> Policy:
-            return workshop.training.train(start, starts, iterations=iterations, seed=seed, after=after)
+            return workshop.training.train(start, plan.starts, iterations=plan.iterations, seed=seed, after=after)
 
-        return workshop.made(f"{name}-{policy}-{seed}", train)
+        return workshop.made(f"{plan.name}-{policy}-{seed}", train)
 
     afterwards = []
     for seed in range(case.scale.seeds):
-        new = {f"after {policy}": trained(policy, seed) for policy in policies}
+        new = {f"after {policy}": trained(policy, seed) for policy in plan.policies}
         against = {f"after {UNLEARNED}": f"after {CONTROL}"}
-        both = performance.joined(stage.perform(new))
+        both = before.joined(stage.perform(new))
         found = compare(both, every, against=against, seed=case.seed, policies=list(new))
-        afterwards.append({policy: found[f"after {policy}"] for policy in policies})
+        afterwards.append({policy: found[f"after {policy}"] for policy in plan.policies})
     return Recovery(
-        iterations=iterations,
-        before=compare(performance, every, against=case.against, seed=case.seed),
+        iterations=plan.iterations,
+        before=compare(before, every, against=case.against, seed=case.seed),
         after=over_seeds(afterwards),
     )
