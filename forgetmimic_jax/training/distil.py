@@ -9,7 +9,7 @@ distillation continues with the same bits.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import jax
@@ -101,14 +101,7 @@ def begin(env: Environment, assets: Assets, teaching: Teaching, student: Policy,
     )
 
 
-def distil(
-    env: Environment,
-    assets: Assets,
-    teaching: Teaching,
-    state: DistilState,
-    config: DistilConfig,
-    report: Callable[[DistilState, Mapping[str, float]], None] = lambda state, metrics: None,
-) -> Distilled:
+def distil(env: Environment, assets: Assets, teaching: Teaching, state: DistilState, config: DistilConfig) -> Distilled:
     """Rounds until the student is as good as its teachers, or until `config.rounds`.
 
     Args:
@@ -117,14 +110,12 @@ def distil(
         teaching: who teaches what.
         state: from `begin`, or of a distillation that was interrupted.
         config: settings.
-        report: called with the state and the metrics of every round; it may save the state.
     """
     one_round = make_round(env, config)
     score = jax.jit(lambda assets, teaching, student: score_of(env, assets, teaching, student))
     teachers = score(assets, teaching, None)
     for done in range(int(state.round) + 1, config.rounds + 1):
-        state, metrics = one_round(assets, teaching, state)
-        report(state, {name: float(value) for name, value in metrics.items()})
+        state, _ = one_round(assets, teaching, state)
         alone = float(config.share(done - 1)) == 0.0
         if alone and done % config.check_every == 0 and done < config.rounds:
             found = score(assets, teaching, state.student)

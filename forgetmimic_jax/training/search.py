@@ -11,7 +11,6 @@ If the search finds a way, the clip is feasible. If it finds none, the clip may 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -77,15 +76,7 @@ def first_failures(env: Environment, assets: Assets, policy: Policy) -> np.ndarr
     return np.where(survived < np.asarray(state.horizon), survived, -1)[:clips]
 
 
-def search(
-    env: Environment,
-    assets: Assets,
-    policy: Policy,
-    clip: int,
-    failure: int,
-    config: SearchConfig,
-    report: Callable[[int, Mapping[str, float]], None] = lambda done, metrics: None,
-) -> Found:
+def search(env: Environment, assets: Assets, policy: Policy, clip: int, failure: int, config: SearchConfig) -> Found:
     """Actions that pass frame `failure` of a clip, where the policy fails.
 
     Args:
@@ -95,7 +86,6 @@ def search(
         clip: index of the clip.
         failure: frame at which the policy fails; see `first_failures`.
         config: size of the search.
-        report: called after every round with the rounds done and what they gave.
 
     Raises:
         ValueError: the clip ends before a step can be searched.
@@ -130,7 +120,6 @@ def search(
         best = knots[np.argsort(-(survived / steps + tracked), kind="stable")[:elites]]
         mean = config.keep * mean + (1.0 - config.keep) * best.mean(0)
         std = np.maximum(config.keep * std + (1.0 - config.keep) * best.std(0), config.least_std)
-        report(number + 1, {"passed": float((survived == steps).mean()), "reset_noise": noise})
     passed, _, lessons = rollouts(mean, 1.0, keys[-1], record=True)
     passed = passed == steps
     return Found(

@@ -278,13 +278,11 @@ def test_student_becomes_as_good_as_two_teachers_and_stops(env, assets, two, pol
         success_tolerance=0.13,
     )
     start = begin(env, assets, two, policy(3, scale=1000.0), jax.random.PRNGKey(0))
-    rounds = []
-    result = distil(env, assets, two, start, config, lambda state, metrics: rounds.append(int(state.round)))
+    result = distil(env, assets, two, start, config)
     assert result.enough
     assert is_enough(config, result.student, result.teachers)
     assert not is_enough(config, score_of(env, assets, two, start.student), result.teachers)
-    assert rounds == list(range(1, int(result.state.round) + 1))
-    assert 80 < len(rounds) < 200  # not before it acts alone
+    assert 80 < int(result.state.round) < 200  # not before it acts alone
     episodes = fresh_episodes(env, assets, two, jax.random.PRNGKey(9))
     observation, clip = tracking.observe(env, assets, episodes, None)[0], np.asarray(episodes.clip)
     now = np.asarray(result.state.student.mean_action(observation))
