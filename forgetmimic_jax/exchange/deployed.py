@@ -43,11 +43,11 @@ class Deployed:
         return np.concatenate([np.ravel(TERMS[name](seen)) for name in self.names]).astype(np.float32)
 
     def joint_target(self, reference: Frames, action: np.ndarray) -> np.ndarray:
-        """PD targets f64[joint] in the model's order."""
+        """Joint targets f64[joint] rad of the PD loops, in the model's order."""
         origin = self.default if self.offset else reference.joint_pos[self.joints]
-        target = np.zeros(len(action))
-        target[self.joints] = origin + self.scale * action
-        return target
+        joint_target = np.zeros(len(action))
+        joint_target[self.joints] = origin + self.scale * action
+        return joint_target
 
 
 class Seen(NamedTuple):

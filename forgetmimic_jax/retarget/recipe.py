@@ -20,7 +20,7 @@ from forgetmimic_jax.retarget.cycle import resampled
 from forgetmimic_jax.retarget.deepmimic import forward_kinematics, read_deepmimic
 from forgetmimic_jax.retarget.planar import PlanarTransform, heading, tile
 from forgetmimic_jax.retarget.refine import Weights, refine
-from forgetmimic_jax.retarget.retarget import Targets, inverse_kinematics, leg_scale, make_targets
+from forgetmimic_jax.retarget.retarget import Goals, inverse_kinematics, leg_scale, make_goals
 from forgetmimic_jax.retarget.timeline import Timeline
 from forgetmimic_jax.robot.model import Robot
 
@@ -82,13 +82,13 @@ def retarget_clip(robot: Robot, path: Path, name: str, settings: Settings) -> Re
     motion, human_step = resampled(read_deepmimic(path), FPS, time_scale)
     human = forward_kinematics(motion)
     step = None if human_step is None else PlanarTransform(human_step.yaw, human_step.shift * scale)
-    targets = make_targets(robot, human)
+    goals = make_goals(robot, human)
     qpos = refine(
         robot,
-        targets,
+        goals,
         human_contact(human, FPS * time_scale),  # speeds of the human's own time
-        inverse_kinematics(robot, targets),
-        Timeline(targets.num_frames, step, FPS),
+        inverse_kinematics(robot, goals),
+        Timeline(goals.num_frames, step, FPS),
     )
     cycle = Clip(name, FPS, robot.joint_names, qpos[:, :3], quaternion(rotation(qpos[:, 3:7])), qpos[:, 7:])
     clip = cycle if step is None else tile(cycle, step, settings.seconds)
@@ -97,19 +97,19 @@ def retarget_clip(robot: Robot, path: Path, name: str, settings: Settings) -> Re
         scale,
         time_scale,
         None if step is None else cycle.num_frames,
-        direction_error(robot, targets, qpos),
+        direction_error(robot, goals, qpos),
     )
 
 
-def direction_error(robot: Robot, targets: Targets, qpos: np.ndarray) -> float:
+def direction_error(robot: Robot, goals: Goals, qpos: np.ndarray) -> float:
     """Mean angle in rad between the directions of the human's limbs and the robot's, over limbs and frames."""
-    limbs = [vector for vector in targets.vectors if vector.start is not None]
+    limbs = [vector for vector in goals.vectors if vector.start is not None]
     data = mujoco.MjData(robot.model)
     angles = np.empty((len(qpos), len(limbs)))
     for frame, row in enumerate(qpos):
         data.qpos[:] = row
         mujoco.mj_kinematics(robot.model, data)
-        cosines = [limb.value(data) @ limb.target[frame] for limb in limbs]
+        cosines = [limb.value(data) @ limb.goal[frame] for limb in limbs]
         angles[frame] = np.arccos(np.clip(cosines, -1.0, 1.0))
     return float(angles.mean())
 

@@ -20,7 +20,7 @@ from forgetmimic_jax.retarget.contact import HumanContact, human_parts
 from forgetmimic_jax.retarget.dynamics import floor_wrench, motor_torque
 from forgetmimic_jax.retarget.least_squares import Term, gauss_newton
 from forgetmimic_jax.retarget.pose import Pose, pose_of
-from forgetmimic_jax.retarget.retarget import Targets
+from forgetmimic_jax.retarget.retarget import Goals
 from forgetmimic_jax.retarget.timeline import Timeline, cross_matrix
 from forgetmimic_jax.robot.model import Robot
 
@@ -56,7 +56,7 @@ class Weights:
 
 def refine(
     robot: Robot,
-    targets: Targets,
+    goals: Goals,
     contact: HumanContact,
     qpos: np.ndarray,
     timeline: Timeline,
@@ -66,7 +66,7 @@ def refine(
 
     Args:
         robot: the robot.
-        targets: limb directions, orientations and the hips' path.
+        goals: limb directions, orientations and the hips' path.
         contact: when soles are planted and when the body flies.
         qpos: where to start, from inverse kinematics.
         timeline: of the frames; a cyclic clip's step is at the robot's scale.
@@ -74,7 +74,7 @@ def refine(
     """
     weights = Weights()
     gentle, strict = (
-        Problem.of(robot, targets, contact, timeline, given) for given in (weights.with_dynamics(GENTLE), weights)
+        Problem.of(robot, goals, contact, timeline, given) for given in (weights.with_dynamics(GENTLE), weights)
     )
 
     def solved(problem: Problem, start: np.ndarray) -> tuple[np.ndarray, float]:
@@ -91,7 +91,7 @@ class Problem:
     """The residuals of a clip."""
 
     robot: Robot
-    targets: Targets
+    goals: Goals
     contact: HumanContact
     timeline: Timeline
     weights: Weights
@@ -99,10 +99,10 @@ class Problem:
     parts: tuple[str, ...]  # the human's, that the floor points stand for
 
     @classmethod
-    def of(cls, robot: Robot, targets: Targets, contact: HumanContact, timeline: Timeline, weights: Weights) -> Problem:
+    def of(cls, robot: Robot, goals: Goals, contact: HumanContact, timeline: Timeline, weights: Weights) -> Problem:
         """The problem with the robot's floor points."""
         floor = floor_points(robot)
-        return cls(robot, targets, contact, timeline, weights, floor, human_parts(robot, floor))
+        return cls(robot, goals, contact, timeline, weights, floor, human_parts(robot, floor))
 
     @property
     def frames(self) -> int:
@@ -135,7 +135,7 @@ class Problem:
     def imitation(self, pose: Pose) -> Iterator[Term]:
         """The human's directions and orientations, the hips' path, a weak pull to the default pose."""
         every = np.arange(self.frames)
-        for vector in self.targets.vectors:
+        for vector in self.goals.vectors:
             if vector.start is None:
                 value = pose.turns[:, vector.end, :, 1]
                 jacobian = -cross_matrix(value) @ pose.turns_jac[:, vector.end]
@@ -145,14 +145,14 @@ class Problem:
                 value = along / length
                 project = (np.eye(3) - value[:, :, None] * value[:, None, :]) / length[:, None]
                 jacobian = project @ (pose.bodies_jac[:, vector.end] - pose.bodies_jac[:, vector.start])
-            yield Term(every, vector.cost * (value - vector.target), {0: vector.cost * jacobian})
-        for orientation in self.targets.orientations:
-            error = (Rotation.from_matrix(pose.turns[:, orientation.body]) * orientation.target.inv()).as_rotvec()
+            yield Term(every, vector.cost * (value - vector.goal), {0: vector.cost * jacobian})
+        for orientation in self.goals.orientations:
+            error = (Rotation.from_matrix(pose.turns[:, orientation.body]) * orientation.goal.inv()).as_rotvec()
             jacobian = pose.turns_jac[:, orientation.body]
             yield Term(every, orientation.cost * error, {0: orientation.cost * jacobian})
-        hips = list(self.targets.hip_bodies)
+        hips = list(self.goals.hip_bodies)
         weight = self.weights.hip_centre
-        error = pose.bodies[:, hips].mean(axis=1) - self.targets.hip_centre
+        error = pose.bodies[:, hips].mean(axis=1) - self.goals.hip_centre
         yield Term(every, weight * error, {0: weight * pose.bodies_jac[:, hips].mean(axis=1)})
         default = np.asarray(self.robot.arrays.default_joint_pos, np.float64)
         pull = np.where(self.robot.motor_counts, self.weights.posture, self.weights.wrist_posture)

@@ -29,12 +29,12 @@ HINGES = {"thigh": "knees", "upper_arm": "elbows"}  # human limb: the pair of bo
 
 @dataclass(frozen=True)
 class Vector:
-    """A unit vector of the robot to point along a target: from the origin of `start` to `end`, or `end`'s y axis."""
+    """A unit vector of the robot to point along a goal: from the origin of `start` to `end`, or `end`'s y axis."""
 
     name: str
     start: int | None
     end: int
-    target: np.ndarray  # [frame, 3] world
+    goal: np.ndarray  # [frame, 3] world
     cost: float
 
     def value(self, data: mujoco.MjData) -> np.ndarray:
@@ -64,12 +64,12 @@ class Orientation:
 
     name: str
     body: int
-    target: Rotation  # [frame]
+    goal: Rotation  # [frame]
     cost: float
 
 
 @dataclass(frozen=True)
-class Targets:
+class Goals:
     """What the robot is to do, [frame, ...], world frame."""
 
     hip_bodies: tuple[int, int]
@@ -92,7 +92,7 @@ def leg_scale(robot: Robot) -> float:
     return (np.linalg.norm(knee - hip) + np.linalg.norm(foot - knee) + foot[2] - sole) / LEG_LENGTH
 
 
-def make_targets(robot: Robot, pose: HumanPose) -> Targets:
+def make_goals(robot: Robot, pose: HumanPose) -> Goals:
     """Directions from the human's limbs; the hips' path scaled by the legs' ratio."""
     scale = leg_scale(robot)
     orientations = [
@@ -104,12 +104,12 @@ def make_targets(robot: Robot, pose: HumanPose) -> Targets:
         body = {role: pair[row] for role, pair in vars(robot.pairs).items()}
         orientations.append(Orientation(f"{side}_foot", body["feet"], pose.frames[f"{side}_foot"], 0.3))
         for limb, (start, end) in LIMBS.items():
-            target = pose.frames[f"{side}_{limb}"].apply([0.0, 0.0, -1.0])
-            vectors.append(Vector(f"{side}_{limb}", body[start], body[end], target, 1.0))
+            goal = pose.frames[f"{side}_{limb}"].apply([0.0, 0.0, -1.0])
+            vectors.append(Vector(f"{side}_{limb}", body[start], body[end], goal, 1.0))
         for limb, role in HINGES.items():
             axis = pose.frames[f"{side}_{limb}"].apply([0.0, 1.0, 0.0])
             vectors.append(Vector(f"{side}_{limb}_hinge", None, body[role], axis, 0.15))
-    return Targets(robot.pairs.hips, pose.points["pelvis"] * scale, tuple(orientations), tuple(vectors), scale)
+    return Goals(robot.pairs.hips, pose.points["pelvis"] * scale, tuple(orientations), tuple(vectors), scale)
 
 
 class VectorTask(mink.Task):
@@ -121,35 +121,35 @@ class VectorTask(mink.Task):
         self.frame = 0
 
     def compute_error(self, configuration: mink.Configuration) -> np.ndarray:
-        return self.vector.value(configuration.data) - self.vector.target[self.frame]
+        return self.vector.value(configuration.data) - self.vector.goal[self.frame]
 
     def compute_jacobian(self, configuration: mink.Configuration) -> np.ndarray:
         return self.vector.jacobian(configuration.model, configuration.data)
 
 
-def inverse_kinematics(robot: Robot, targets: Targets, limit_margin: float = 0.02) -> np.ndarray:
+def inverse_kinematics(robot: Robot, goals: Goals, limit_margin: float = 0.02) -> np.ndarray:
     """Frame by frame, each started from the one before: qpos [frame, 7 + joint]."""
     model = robot.model
     hip_offset = _hip_centre_offset(robot)
-    base = targets.orientations[0]
-    base_pos = targets.hip_centre - base.target.apply(hip_offset)
-    base_quat = quaternion(base.target)
+    base = goals.orientations[0]
+    base_pos = goals.hip_centre - base.goal.apply(hip_offset)
+    base_quat = quaternion(base.goal)
 
     frame_tasks = [
         mink.FrameTask(orientation.body, "body", 2.0 if orientation is base else 0.0, orientation.cost)
-        for orientation in targets.orientations
+        for orientation in goals.orientations
     ]
-    vector_tasks = [VectorTask(vector) for vector in targets.vectors]
+    vector_tasks = [VectorTask(vector) for vector in goals.vectors]
     rest = np.concatenate([base_pos[0], base_quat[0], np.asarray(robot.arrays.default_joint_pos, np.float64)])
     posture = mink.PostureTask(model, cost=0.03)
     posture.set_target(rest)
     limits = [mink.ConfigurationLimit(model, min_distance_from_limits=limit_margin)]
 
     configuration = mink.Configuration(model, rest)
-    qpos = np.empty((targets.num_frames, model.nq))
-    for frame in range(targets.num_frames):
-        for task, orientation in zip(frame_tasks, targets.orientations, strict=True):
-            turn = mink.SO3(orientation.target[frame].as_quat(scalar_first=True))
+    qpos = np.empty((goals.num_frames, model.nq))
+    for frame in range(goals.num_frames):
+        for task, orientation in zip(frame_tasks, goals.orientations, strict=True):
+            turn = mink.SO3(orientation.goal[frame].as_quat(scalar_first=True))
             task.set_target(mink.SE3.from_rotation_and_translation(turn, base_pos[frame]))
         for vector_task in vector_tasks:
             vector_task.frame = frame

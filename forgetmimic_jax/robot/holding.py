@@ -31,15 +31,15 @@ class Held:
 
 
 def hold(robot: Robot, seconds: float = 1.0) -> Held:
-    """Simulate the default pose, standing on the ground, as the targets of the PD gains."""
+    """Simulate the default pose, standing on the ground, as the joint targets of the PD gains."""
     model, data = robot.model, mujoco.MjData(robot.model)
-    targets = np.asarray(robot.arrays.default_joint_pos, np.float64)
-    data.qpos[:7], data.qpos[7:] = [0.0, 0.0, robot.default_height, 1.0, 0.0, 0.0, 0.0], targets
-    data.ctrl[:] = targets
+    joint_target = np.asarray(robot.arrays.default_joint_pos, np.float64)
+    data.qpos[:7], data.qpos[7:] = [0.0, 0.0, robot.default_height, 1.0, 0.0, 0.0, 0.0], joint_target
+    data.ctrl[:] = joint_target
     while data.time < seconds:
         mujoco.mj_step(model, data)
     upright = float(np.clip(data.xmat[1].reshape(3, 3)[2, 2], -1.0, 1.0))
     tilt, drop = float(np.degrees(np.arccos(upright))), robot.default_height - float(data.qpos[2])
-    error = float(np.abs(data.qpos[7:] - targets).max())
+    error = float(np.abs(data.qpos[7:] - joint_target).max())
     stands = tilt < MAX_TILT and abs(drop) < MAX_DROP * robot.default_height and error < MAX_ERROR
     return Held(tilt, drop, error, stands)

@@ -19,7 +19,7 @@ from forgetmimic_jax.tracking.layouts import TERMS, Layout, find_layout
 from forgetmimic_jax.tracking.observation import critic_size
 from forgetmimic_jax.training.checkpoint import CheckpointInfo, load_policy
 
-Places = tuple[np.ndarray, np.ndarray]  # of the same things, for the source and for the target
+Places = tuple[np.ndarray, np.ndarray]  # of the same things, for the old robot and for the new one
 REMEMBERED = 1e6  # observations that the statistics carried over count for: the new robot's soon outweigh them
 
 
@@ -31,48 +31,48 @@ def policy_for(robot: Robot, info: CheckpointInfo) -> Policy:
         info: of the other robot's checkpoint.
 
     Raises:
-        InputError: the robots have no joint, or not as many key bodies, in common, or the source has changed.
+        InputError: the robots have no joint, or not as many key bodies, in common, or the old one has changed.
     """
     path, name = info.path, info.robot
-    source = load_robot(name, action=info.config.action)
-    if info.joints != source.joint_names:
+    old = load_robot(name, action=info.config.action)
+    if info.joints != old.joint_names:
         raise InputError(f"{path}: joints: not those of robots/{name} today, in their order")
-    found, needed = len(source.key_bodies), len(robot.key_bodies)
+    found, needed = len(old.key_bodies), len(robot.key_bodies)
     if found != needed:
         raise InputError(f"{path}: key_bodies: '{name}' has {found}; {needed} are needed, as '{robot.name}' has")
-    if not shared_joints(source, robot)[0].size:
+    if not shared_joints(old, robot)[0].size:
         raise InputError(f"{path}: joints: '{name}' has none that is called as one of '{robot.name}'")
     layout, key = find_layout(info.config.observation.layout), jax.random.PRNGKey(info.config.seed)
     sizes = layout.size(robot.num_joints), critic_size(layout, robot)
     fresh = init_policy(info.config.ppo, robot.num_joints, *sizes, key)
-    return carried_over(load_policy(info, source), info.config, source, robot, fresh)
+    return carried_over(load_policy(info, old), info.config, old, robot, fresh)
 
 
-def carried_over(policy: Policy, config: Config, source: Robot, target: Robot, fresh: Policy) -> Policy:
-    """`policy` of robot `source` as a start for `target`: inputs and outputs go with the joint they belong to, by name.
+def carried_over(policy: Policy, config: Config, old: Robot, new: Robot, fresh: Policy) -> Policy:
+    """`policy` of robot `old` as a start for `new`: inputs and outputs go with the joint they belong to, by name.
 
-    A joint that only the target has starts unheard, its action at 0; one that only the source has is left out. Means of
+    A joint that only the new robot has starts unheard, its action at 0; one that only the old has is left out. Means of
     the observations move with the default pose and the height. A residual action stays as it is, the same share of the
     joint's torque; an action on the default pose becomes the one of the same joint target. What the critic alone sees
     is per key body, in the order of the robots' roles, and stays in place.
 
     Args:
-        policy: of the source.
-        config: of the source: what both see, and what an action is added to.
-        source: robot of as many key bodies as the target, in the same roles.
-        target: another robot.
-        fresh: a random policy of the target, with the same hidden layers.
+        policy: of the old robot.
+        config: of the old robot: what both see, and what an action is added to.
+        old: robot of as many key bodies as the new one, in the same roles.
+        new: another robot.
+        fresh: a random policy of the new robot, with the same hidden layers.
     """
-    layout, places = find_layout(config.observation.layout), shared_joints(source, target)
-    actions = _actions(config, source, target)
-    rows, output = _features(layout, source, target), (np.arange(1), np.arange(1))
+    layout, places = find_layout(config.observation.layout), shared_joints(old, new)
+    actions = _actions(config, old, new)
+    rows, output = _features(layout, old, new), (np.arange(1), np.arange(1))
     size, new_size = policy.actor_normalizer.mean.size, fresh.actor_normalizer.mean.size
     private = np.arange(policy.critic_normalizer.mean.size - size)  # of the critic alone
     critic_rows = (np.append(rows[0], size + private), np.append(rows[1], new_size + private))
     normalizers = (policy.actor_normalizer, policy.critic_normalizer)
-    actor_normalizer, critic_normalizer = (_moved(of, layout, actions, source, target) for of in normalizers)
+    actor_normalizer, critic_normalizer = (_moved(of, layout, actions, old, new) for of in normalizers)
     actor, critic = policy.actor["params"], policy.critic["params"]
-    log_std = np.full(target.num_joints, np.mean(actor["log_std"]), np.float32)
+    log_std = np.full(new.num_joints, np.mean(actor["log_std"]), np.float32)
     log_std[places[1]] = (np.asarray(actor["log_std"]) + np.log(actions.ratio))[places[0]]
     actor = {
         "MLP_0": _placed(actions.of(actor["MLP_0"]), fresh.actor["params"]["MLP_0"], rows, places),
@@ -90,9 +90,9 @@ def carried_over(policy: Policy, config: Config, source: Robot, target: Robot, f
 
 
 class Actions(NamedTuple):
-    """What an action of the source becomes for the target, joint by joint: ratio · action + shift."""
+    """What an action of the old robot becomes for the new, joint by joint: ratio · action + shift."""
 
-    ratio: np.ndarray  # [joint] in the source's policy order
+    ratio: np.ndarray  # [joint] in the old robot's policy order
     shift: np.ndarray
 
     def of(self, layers: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -102,14 +102,14 @@ class Actions(NamedTuple):
         return {**layers, last: {"kernel": kernel * self.ratio, "bias": bias * self.ratio + self.shift}}
 
 
-def _actions(config: Config, source: Robot, target: Robot) -> Actions:
+def _actions(config: Config, old: Robot, new: Robot) -> Actions:
     """Of a residual: the same action. On the default pose: the action that asks for the same joint target."""
-    actions = Actions(np.ones(source.num_joints), np.zeros(source.num_joints))
+    actions = Actions(np.ones(old.num_joints), np.zeros(old.num_joints))
     if config.action.mode == "offset":
-        ours, theirs = shared_joints(source, target)
-        scale, new_scale = (_in_policy_order(robot, "action_scale") for robot in (source, target))
+        ours, theirs = shared_joints(old, new)
+        scale, new_scale = (_in_policy_order(robot, "action_scale") for robot in (old, new))
         actions.ratio[ours] = scale[ours] / new_scale[theirs]
-        actions.shift[ours] = _pose_change(source, target) / new_scale[theirs]
+        actions.shift[ours] = _pose_change(old, new) / new_scale[theirs]
     return actions
 
 
@@ -118,24 +118,24 @@ def _in_policy_order(robot: Robot, field: str) -> np.ndarray:
     return np.asarray(getattr(robot.arrays, field))[robot.policy_joints]
 
 
-def _pose_change(source: Robot, target: Robot) -> np.ndarray:
-    """The source's default pose less the target's, rad, of the joints that both have."""
-    poses = (_in_policy_order(robot, "default_joint_pos") for robot in (source, target))
-    here, there = (pose[joints] for pose, joints in zip(poses, shared_joints(source, target), strict=True))
+def _pose_change(old: Robot, new: Robot) -> np.ndarray:
+    """The old robot's default pose less the new one's, rad, of the joints that both have."""
+    poses = (_in_policy_order(robot, "default_joint_pos") for robot in (old, new))
+    here, there = (pose[joints] for pose, joints in zip(poses, shared_joints(old, new), strict=True))
     return here - there
 
 
-def shared_joints(source: Robot, target: Robot) -> Places:
-    """The joints that both robots have, as places in the source's and in the target's policy order."""
-    orders = source.policy_joint_names, target.policy_joint_names
+def shared_joints(old: Robot, new: Robot) -> Places:
+    """The joints that both robots have, as places in the old one's and in the new one's policy order."""
+    orders = old.policy_joint_names, new.policy_joint_names
     names = [name for name in orders[0] if name in orders[1]]
     return tuple(np.array([order.index(name) for name in names], int) for order in orders)  # type: ignore[return-value]
 
 
-def _features(layout: Layout, source: Robot, target: Robot) -> Places:
-    """The actor's observations that both robots have, as places among the source's and among the target's."""
+def _features(layout: Layout, old: Robot, new: Robot) -> Places:
+    """The actor's observations that both robots have, as places among the old one's and the new one's."""
     result = []
-    for robot, joints in zip((source, target), shared_joints(source, target), strict=True):
+    for robot, joints in zip((old, new), shared_joints(old, new), strict=True):
         places, every = layout.places(robot.num_joints), np.arange(layout.size(robot.num_joints))
         parts = []
         for term in layout.terms:
@@ -145,14 +145,14 @@ def _features(layout: Layout, source: Robot, target: Robot) -> Places:
     return result[0], result[1]
 
 
-def _moved(of: Normalizer, layout: Layout, actions: Actions, source: Robot, target: Robot) -> Normalizer:
-    """Statistics of the source's observations, actor's first, for a robot of the target's height, pose and actions."""
+def _moved(of: Normalizer, layout: Layout, actions: Actions, old: Robot, new: Robot) -> Normalizer:
+    """Statistics of the old robot's observations, actor's first, for the new one's height, pose and actions."""
     mean, variance = np.array(of.mean), np.array(of.variance)
-    for name, here in layout.places(source.num_joints).items():  # a slice is a view: what follows changes the arrays
+    for name, here in layout.places(old.num_joints).items():  # a slice is a view: what follows changes the arrays
         if TERMS[name].height:
-            mean[here] *= relative_height(target.model) / relative_height(source.model)
+            mean[here] *= relative_height(new.model) / relative_height(old.model)
         if TERMS[name].encoder:
-            mean[here][shared_joints(source, target)[0]] += _pose_change(source, target)
+            mean[here][shared_joints(old, new)[0]] += _pose_change(old, new)
         if name == "actions":
             mean[here] = mean[here] * actions.ratio + actions.shift
             variance[here] *= actions.ratio**2

@@ -50,11 +50,11 @@ def speed(setup: Setup, *, repeats: int, started: float) -> Figures:
 
     environment = _environment_alone(env)
     collect_alone = jax.jit(lambda assets, state: collect(env, assets, state, Rule()))
-    _, (physics, targets, *_) = jax.block_until_ready(
+    _, (physics, joint_targets, *_) = jax.block_until_ready(
         environment(assets, state.env, state.failure_level, jax.random.PRNGKey(1))
     )
     jax.block_until_ready(collect_alone(assets, state))
-    raw = _raw_stepping(setup.robot.model, env.num_envs, config.physics.substeps, physics, targets)
+    raw = _raw_stepping(setup.robot.model, env.num_envs, config.physics.substeps, physics, joint_targets)
 
     seconds: dict[str, list[float]] = {"raw": [], "environment": [], "collect": [], "iteration": []}
     for repeat in range(repeats):
@@ -173,10 +173,10 @@ def _environment_alone(env: tracking.Environment) -> Callable:
     return environment
 
 
-def _raw_stepping(model, num_envs: int, substeps: int, physics, targets) -> Callable[[], float]:
-    """Seconds that plain `mujoco.batch` needs for the same states and targets; loading them is not counted."""
+def _raw_stepping(model, num_envs: int, substeps: int, physics, joint_targets) -> Callable[[], float]:
+    """Seconds that plain `mujoco.batch` needs for the same states and joint targets; loading them is not counted."""
     batch = mujoco.batch.Batch(model, num_envs, cores())
-    rows = [np.asarray(x, np.float64) for x in (physics.qpos, physics.qvel, physics.warmstart, targets)]
+    rows = [np.asarray(x, np.float64) for x in (physics.qpos, physics.qvel, physics.warmstart, joint_targets)]
 
     def run() -> float:
         seconds = 0.0

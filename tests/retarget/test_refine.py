@@ -19,7 +19,7 @@ from forgetmimic_jax.retarget.least_squares import Term, gauss_newton_step
 from forgetmimic_jax.retarget.planar import PlanarTransform, heading
 from forgetmimic_jax.retarget.pose import pose_of
 from forgetmimic_jax.retarget.refine import Problem, Weights, refine
-from forgetmimic_jax.retarget.retarget import inverse_kinematics, leg_scale, make_targets
+from forgetmimic_jax.retarget.retarget import inverse_kinematics, leg_scale, make_goals
 from forgetmimic_jax.retarget.timeline import Timeline
 
 FPS = 50.0
@@ -44,12 +44,12 @@ def human(tmp_path, frames, *, loop="none", yaw=0.0, height=LEG_LENGTH, pitch=0.
 def problem_of(robot, motion):
     moved, step = resampled(motion, FPS, 1.0)
     pose = forward_kinematics(moved)
-    targets = make_targets(robot, pose)
+    goals = make_goals(robot, pose)
     if step is not None:
         step = PlanarTransform(step.yaw, step.shift * leg_scale(robot))
-    timeline = Timeline(targets.num_frames, step, FPS)
-    problem = Problem.of(robot, targets, human_contact(pose, FPS), timeline, Weights())
-    return problem, inverse_kinematics(robot, targets)
+    timeline = Timeline(goals.num_frames, step, FPS)
+    problem = Problem.of(robot, goals, human_contact(pose, FPS), timeline, Weights())
+    return problem, inverse_kinematics(robot, goals)
 
 
 @pytest.mark.parametrize("loop", ["none", "wrap"])
@@ -317,7 +317,7 @@ def test_a_cycle_closes(tmp_path, degrees, carried):
 def test_a_standing_human_makes_a_standing_robot(robot, tmp_path):
     """Both soles on the floor and still, the centre of mass over them, joints inside their limits."""
     problem, start = problem_of(robot, human(tmp_path, 12, wave=0.005))
-    qpos = refine(robot, problem.targets, problem.contact, start, problem.timeline, iterations=15)
+    qpos = refine(robot, problem.goals, problem.contact, start, problem.timeline, iterations=15)
     soles = floor_positions(robot, problem.floor, qpos)[:, problem.floor.is_sole]
     assert np.abs(soles[..., 2]).max() < 0.005
     assert (qpos[:, 7:] > robot.joint_lower).all()
