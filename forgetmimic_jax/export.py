@@ -85,14 +85,14 @@ def main(options: Options) -> None:
     content = to_onnx(policy, setup.robot, config, run_path=run_path).SerializeToString()
     evaluator = Evaluator(setup, episodes=options.episodes, seed=options.seed)
     start = evaluator.start()
-    with progress("run the ONNX in MuJoCo", len(evaluator.clip)) as report:
+    with progress("run the ONNX in MuJoCo", len(evaluator.clip)) as show:
         record = run_episodes(
             OnnxActor(content),
             setup.robot,
             setup.library,
             evaluator.config,
             start,
-            report=lambda episodes, steps: report(episodes, steps, {}),
+            progress=lambda episodes, steps: show(episodes, steps, {}),
         )
     expected = np.asarray(jax.jit(policy.mean_action)(record.observations))
     error = float((np.abs(record.actions - expected) / np.maximum(1.0, np.abs(expected))).max())

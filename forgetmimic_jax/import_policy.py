@@ -154,8 +154,8 @@ def _several(
         return not experts.shortfalls(known, trials[-1].clips)
 
     most = experts.MERGING.rounds + experts.REPEATS * experts.MORE.rounds
-    with progress("merge", most, at_most=True) as report:
-        student, steps = experts.merge(setup, teachers, is_enough, report)
+    with progress("merge", most, at_most=True) as show:
+        student, steps = experts.merge(setup, teachers, is_enough, show)
     trial = trials[-1]
     _say_figures({"experts": known, "new policy": trial.clips})
     shortfalls = experts.shortfalls(known, trial.clips)

@@ -175,7 +175,7 @@ def retarget(robot: Robot, options: Retarget) -> None:
 
     recipe.check_output(options.output, overwrite=options.force)
     names = recipe.shipped_clips(robot.name) if options.clips is None else comma_separated(options.clips)
-    recipe.retarget_library(robot, options.source, options.output, names, report=lambda name: print(name, flush=True))
+    recipe.retarget_library(robot, options.source, options.output, names, progress=lambda name: print(name, flush=True))
     closing({"library": options.output}, command_line("motions", "check", robot=robot.name, library=options.output))
 
 

@@ -63,13 +63,13 @@ def main(options: Options) -> None:
     output.mkdir(parents=True, exist_ok=True)
     sheet, drawn = [], 0
     total = sum(len(film.shown_steps(episode, seconds=options.seconds)) for episode in episodes)
-    with film.pane_renderer(options.robot) as renderer, progress("draw", total) as report:
+    with film.pane_renderer(options.robot) as renderer, progress("draw", total) as show:
         for episode in episodes:
             frames = []
             for frame in film.render_clip(renderer, episode, seconds=options.seconds):
                 frames.append(frame)
                 drawn += 1
-                report(drawn, 0, {})
+                show(drawn, 0, {})
             write_atomically(output / f"{episode.clip}.mp4", film.mp4(frames))
             write_atomically(output / f"{episode.clip}.gif", film.gif(frames))
             sheet.append(film.stills(frames, options.stills))

@@ -117,8 +117,8 @@ def gather(
         }
     total = sum(price[name] for name in attacks)
     found: dict[str, Any] = {}
-    with progress("evidence", total) as report:
-        meter = Meter(report, price)
+    with progress("evidence", total) as show:
+        meter = Meter(show, price)
         for name, (kind, make) in attacks.items():
             found[name] = parts.part(name, kind, make)
             meter.finished(name)

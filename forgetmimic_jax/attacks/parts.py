@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from forgetmimic_jax.attacks.document import write_document
-from forgetmimic_jax.basics.console import Report
+from forgetmimic_jax.basics.console import Show
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.basics.files import write_atomically
 from forgetmimic_jax.policy.policy import Policy
@@ -84,16 +84,16 @@ class Parts:
 class Meter:
     """How much is done of all attacks together, in iterations of a training or what takes as long."""
 
-    def __init__(self, report: Report, costs: Mapping[str, int]):
-        self._report, self._costs = report, costs
+    def __init__(self, show: Show, costs: Mapping[str, int]):
+        self._show, self._costs = show, costs
         self._done, self._within = 0, 0
 
     def tick(self) -> None:
         """One iteration of a training is done."""
         self._within += 1
-        self._report(self._done + self._within, 0, {})
+        self._show(self._done + self._within, 0, {})
 
     def finished(self, name: str) -> None:
         """An attack is done, perhaps with fewer iterations than it could have taken."""
         self._done, self._within = self._done + self._costs[name], 0
-        self._report(self._done, 0, {})
+        self._show(self._done, 0, {})

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rich.console import Console
 
-Report = Callable[[int, int, Mapping[str, float]], None]
+# Iterations done, environment steps done, and metrics to show.
+Show = Callable[[int, int, Mapping[str, float]], None]
 
 
 @contextmanager
@@ -26,7 +27,7 @@ def progress(
     at_most: bool = False,
     every_seconds: float = 30.0,
     console: Console | None = None,
-) -> Iterator[Report]:
+) -> Iterator[Show]:
     """A progress bar with time left, environment steps per second and live metrics; plain lines without a terminal.
 
     Args:
@@ -38,8 +39,8 @@ def progress(
         console: where to write; the standard output by default.
 
     Yields:
-        report(iterations done, environment steps done, metrics to show), to be called after each iteration. Time before
-        the first report is not counted: it is compilation.
+        show(iterations done, environment steps done, metrics), to be called after each iteration. Time before the first
+        call is not counted: it is compilation.
     """
     from rich.console import Console
     from rich.progress import (
@@ -65,7 +66,7 @@ def progress(
 
     last_line = time.monotonic()
 
-    def report(done: int, steps: int, metrics: Mapping[str, float]) -> None:
+    def show(done: int, steps: int, metrics: Mapping[str, float]) -> None:
         nonlocal last_line
         iteration_rate, step_rate = clock.rates(done, steps)
         if done >= total_iterations or time.monotonic() - last_line >= every_seconds:
@@ -75,7 +76,7 @@ def progress(
             _plain(console, f"{description}: {done}/{total_iterations}  {left}{_live(step_rate, metrics)}")
 
     _plain(console, f"{description}: {start}/{total_iterations}")
-    yield report
+    yield show
 
 
 def command_line(command: str, *words: str, **flags: object) -> str:

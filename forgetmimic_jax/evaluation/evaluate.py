@@ -52,10 +52,10 @@ def evaluate(
     rollouts = {}
     everyone: dict[str, Policy | None] = {name: subject.policy for name, subject in subjects.items()}
     everyone[ZERO_ACTION] = None
-    with progress("evaluate", len(everyone)) as report:
+    with progress("evaluate", len(everyone)) as show:
         for done, (name, policy) in enumerate(everyone.items(), start=1):
             rollouts[name] = evaluator.rollout(policy)
-            report(done, sum(int(rollout.length.sum()) for rollout in rollouts.values()), {})
+            show(done, sum(int(rollout.length.sum()) for rollout in rollouts.values()), {})
     policies = evaluate_policies(rollouts, setup.library.names, targets, seed=seed)
     if targets and not noise:
         instead = unbounded.roll_out(setup, everyone, targets, episodes=episodes, seed=seed)

@@ -46,7 +46,7 @@ def run_episodes(
     config: Config,
     start: EnvState,
     *,
-    report: Callable[[int, int], None] = lambda episodes, steps: None,
+    progress: Callable[[int, int], None] = lambda episodes, steps: None,
 ) -> Record:
     """Every episode of `start`, from its state to the end of its horizon, falls or not.
 
@@ -56,7 +56,7 @@ def run_episodes(
         library: the clips to track.
         config: of the physics, the reward and the bounds that end an episode.
         start: the episodes (`Evaluator.start`).
-        report: called after each episode with the number of episodes and control steps done.
+        progress: called after each episode with the number of episodes and control steps done.
     """
     numbers = range(len(library.names))
     references = [jax.tree.map(lambda values: values.astype(np.float64), library.clip(number)) for number in numbers]
@@ -68,7 +68,7 @@ def run_episodes(
     ):
         ahead = jax.tree.map(lambda values: values[frame + 1 : frame + 1 + horizon], references[clip])  # noqa: B023
         episodes.append(_run_episode(deployed, ahead, config.physics.substeps, qpos, qvel))
-        report(len(episodes), sum(len(episode["action"]) for episode in episodes))
+        progress(len(episodes), sum(len(episode["action"]) for episode in episodes))
     steps = {name: np.concatenate([episode[name] for episode in episodes]) for name in episodes[0]}
     tracked = np.concatenate([frame + 1 + np.arange(horizon) for frame, horizon in zip(frames, horizons, strict=True)])
     normalized, broken = _judge(config, robot, library, np.repeat(clips, horizons), tracked, steps)

@@ -179,7 +179,7 @@ def merge(
     student: Setup,
     experts: Sequence[tuple[Expert, Sequence[int]]],
     is_enough: Callable[[Policy], bool],
-    report: Callable[[int, int, Mapping[str, float]], None] = lambda done, steps, metrics: None,
+    progress: Callable[[int, int, Mapping[str, float]], None] = lambda done, steps, metrics: None,
 ) -> tuple[Policy, int]:
     """Regress a fresh policy on experts, each with the clips of the student's library that it teaches.
 
@@ -191,7 +191,7 @@ def merge(
         student: robot, clips and settings of the new policy.
         experts: with the indices of their clips.
         is_enough: whether a student is as good as its experts.
-        report: called after each round with the rounds and control steps done and the round's metrics.
+        progress: called after each round with the rounds and control steps done and the round's metrics.
 
     Returns:
         The policy, and the control steps that it took.
@@ -214,7 +214,7 @@ def merge(
             done, steps = done + 1, steps + ROBOTS * config.steps
             shown = {name: float(value) for name, value in metrics.items()}
             _check_finite(shown, done)
-            report(done, steps, shown)
+            progress(done, steps, shown)
         if is_enough(state.student):
             break
     return state.student, steps

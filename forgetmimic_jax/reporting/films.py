@@ -62,8 +62,8 @@ def _filmed(subject: Subject, clips: list[str]) -> dict[str, bytes]:
     contents = {}
     compared = load_comparison(subject.info.path, robot=subject.info.robot, base=subject.base.path, physics="native")
     episodes = record(compared.setup, compared.policies, clips, subject.document.targets)
-    with film.pane_renderer(subject.info.robot) as renderer, progress("film", len(clips)) as report:
+    with film.pane_renderer(subject.info.robot) as renderer, progress("film", len(clips)) as show:
         for finished, episode in enumerate(episodes, start=1):
             contents[episode.clip] = film.mp4(film.render_clip(renderer, episode, seconds=FILM_SECONDS))
-            report(finished, 0, {})
+            show(finished, 0, {})
     return contents

@@ -144,7 +144,7 @@ def retarget_library(
     source: Path,
     output: Path,
     names: Iterable[str] = tuple(CLIPS),
-    report: Callable[[str], None] = lambda name: None,
+    progress: Callable[[str], None] = lambda name: None,
 ) -> Path:
     """Make the shipped library from a folder of DeepMimic clips; nothing is written before every clip is made.
 
@@ -153,7 +153,7 @@ def retarget_library(
         source: folder with humanoid3d_*.txt.
         output: folder of the library.
         names: clips to make.
-        report: called with each clip's name when it is made.
+        progress: called with each clip's name when it is made.
 
     Raises:
         InputError: no clip of that name, or one that is missing from the folder or is not DeepMimic's.
@@ -168,7 +168,7 @@ def retarget_library(
     results = {}
     for name in names:
         results[name] = retarget_clip(robot, source_file(source, name), name, CLIPS[name])
-        report(name)
+        progress(name)
     output.mkdir(parents=True, exist_ok=True)
     entries = {}
     for name, result in results.items():

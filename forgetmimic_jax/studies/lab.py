@@ -277,10 +277,10 @@ class Lab:
         setup = dataclasses.replace(setup, library=library)
         evaluator = Evaluator(setup, episodes=episodes or self.options.episodes, seed=seed, noise=noise)
         rolled = {}
-        with progress("roll out", len(policies)) as report:
+        with progress("roll out", len(policies)) as show:
             for done, (key, path) in enumerate(policies.items(), start=1):
                 rolled[key] = evaluator.rollout(self._policy(path, setup))
-                report(done, 0, {})
+                show(done, 0, {})
         return rolled, library.names
 
     def unbounded(self, policies: Mapping[Any, Path | None]) -> dict[Any, dict[str, np.ndarray]]:

@@ -95,9 +95,7 @@ def run(
         with (
             Log(directory, now.iteration, now.environment_steps) as log,
             stop_requests() as stop,
-            progress_bar(
-                description, config.iterations, start=now.iteration, at_most=at_most, console=console
-            ) as report,
+            progress_bar(description, config.iterations, start=now.iteration, at_most=at_most, console=console) as show,
         ):
             now = dataclasses.replace(now, state=spread(mesh, now.state))
             now = course_after(course.begin)
@@ -113,7 +111,7 @@ def run(
                 log.add(metrics)
                 if now.iteration == 1 or now.iteration % LOG_EVERY == 0:
                     log.write(now.iteration, steps, setup.library.names, course.note)
-                report(now.iteration, steps, _live(metrics))
+                show(now.iteration, steps, _live(metrics))
                 now = course_after(course.after)
                 if now.iteration % config.checkpoint_every == 0:
                     saved = save()  # after the evaluation, which a run that is resumed from here does not make again

@@ -8,9 +8,9 @@ from forgetmimic_jax.basics.console import closing, command_line, progress
 
 def test_without_a_terminal_there_are_plain_lines():
     console = Console(file=io.StringIO(), force_terminal=False, width=40)
-    with progress("training", 3, every_seconds=1e6, console=console) as report:
+    with progress("training", 3, every_seconds=1e6, console=console) as show:
         for iteration in (1, 2, 3):
-            report(iteration, 100 * iteration, {"tracking_reward": 0.5})
+            show(iteration, 100 * iteration, {"tracking_reward": 0.5})
     lines = console.file.getvalue().splitlines()
     assert lines[0] == "training: 0/3"
     assert len(lines) == 2  # the interval has not passed: only the start and the end
@@ -20,9 +20,9 @@ def test_without_a_terminal_there_are_plain_lines():
 
 def test_what_may_end_sooner_has_at_most_so_long_left():
     console = Console(file=io.StringIO(), force_terminal=False, width=40)
-    with progress("forget", 3, at_most=True, every_seconds=0.0, console=console) as report:
+    with progress("forget", 3, at_most=True, every_seconds=0.0, console=console) as show:
         for iteration in (1, 2, 3):
-            report(iteration, 100 * iteration, {})
+            show(iteration, 100 * iteration, {})
     assert console.file.getvalue().splitlines()[-1].startswith("forget: 3/3  at most 0 min left  ")
 
 

@@ -108,5 +108,5 @@ def test_every_step_to_the_horizon_is_recorded(record):
 def test_progress_is_message_after_each_episode(evaluator, exported, robot, library):
     message = []
     short = dataclasses.replace(evaluator.start(), horizon=np.full(4, 3))
-    run_episodes(exported, robot, library, evaluator.config, short, report=lambda *done: message.append(done))
+    run_episodes(exported, robot, library, evaluator.config, short, progress=lambda *done: message.append(done))
     assert message == [(1, 3), (2, 6), (3, 9), (4, 12)]
