@@ -14,6 +14,7 @@ from typing import Any
 
 import msgspec
 
+from forgetmimic_jax.attacks.control import check_never_rolled_out
 from forgetmimic_jax.attacks.document import FILE as EVIDENCE
 from forgetmimic_jax.attacks.document import EvidenceDocument, read_evidence
 from forgetmimic_jax.basics.errors import InputError
@@ -26,7 +27,7 @@ from forgetmimic_jax.evaluation.verdict import NO_CONTROL, NO_RELEARNING, NotMea
 from forgetmimic_jax.reporting.subject import Subject
 from forgetmimic_jax.settings.config import load_config
 from forgetmimic_jax.training.checkpoint import policy_hash
-from forgetmimic_jax.unlearning.registry import find_method, method_of, methods
+from forgetmimic_jax.unlearning.registry import find_method, method_of
 
 # Settings whose difference is named before another's.
 FIRST = ("robot", "unlearn.method", "unlearn.targets", "unlearn.settings.penalty", "iterations", "preset")
@@ -68,7 +69,7 @@ def read_control(run: Path | None, subject: Subject) -> PolicyResult | NotMeasur
         return NO_CONTROL
     config, path = load_config(run / "config.yaml"), run / FILE
     method = method_of(config)
-    _check_never_rolled_out(f"{run}/config.yaml", comparable_settings(config), subject)
+    check_never_rolled_out(f"{run}/config.yaml", comparable_settings(config), subject.document.targets)
     document, ours = read_evaluation(path), subject.document
     for field in ("robot", "library_hash", "seed", "episodes"):
         _same(f"{path}: {field}", getattr(document, field), getattr(ours, field))
@@ -153,7 +154,8 @@ def _against_control(
     poor = []
     for start in starts:
         origin = origins.starts[start]
-        _check_never_rolled_out(f"{path}: results.origins.starts.{start}", origin.settings, subject)
+        where = f"{path}: results.origins.starts.{start}"
+        check_never_rolled_out(where, origin.settings, subject.document.targets)
         pairs = {at: (run, theirs[start][at]) for at, run in unlearned.items() if at in theirs[start]}
         kept = [origin.kept_skill.get(repeat) for repeat in pairs]
         if pairs and all(skill is not None and (skill.low or 0.0) >= KEPT for skill in kept):
@@ -162,20 +164,6 @@ def _against_control(
     return NotMeasured(
         f"Relearning was not used: in {path} {' and '.join(poor)} of the kept clips' skill; {COMPETENT}."
     )
-
-
-def _check_never_rolled_out(where: str, settings: Mapping[str, Any], subject: Subject) -> None:
-    """InputError unless a policy of these settings started fresh and never rolled out one of the subject's targets."""
-    method = settings.get("unlearn.method")
-    fresh = [name for name, of in methods().items() if of.start != "base"]
-    if method not in fresh or not settings.get("unlearn.targets"):
-        raise InputError(f"{where}: unlearn.method: found {method}, no control; accepted: {', '.join(fresh)}")
-    if settings.get("sampling.clips") != "kept":
-        raise InputError(
-            f"{where}: sampling.clips: found {settings.get('sampling.clips')}, so the control rolled out the targets; "
-            f"accepted: kept"
-        )
-    _same(f"{where}: unlearn.targets", settings["unlearn.targets"], sorted(subject.document.targets))
 
 
 def _check_trained_alike(path: Path, origins: Origins, subject: Subject) -> None:

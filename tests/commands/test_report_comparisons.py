@@ -167,23 +167,23 @@ def refusal(refused, run: Path, folder: Path, *, control: Path | None = None, st
     [
         (
             {"config": {"sampling.clips": "all"}},
-            "config.yaml: sampling.clips: found all, so the control rolled out the targets; accepted: kept",
+            "config.yaml: sampling.clips: found all; accepted for a control: kept",
         ),
         (
             {"config": {"unlearn.method": "retrain", "sampling.clips": "all"}},
-            "config.yaml: sampling.clips: found all, so the control rolled out the targets; accepted: kept",
+            "config.yaml: sampling.clips: found all; accepted for a control: kept",
         ),
         (
             {"config": {"unlearn.targets": ("nod",)}},
-            "config.yaml: unlearn.targets: found ['nod']; accepted: ['turn'], as in the unlearned run",
+            "config.yaml: unlearn.targets: found ['nod']; accepted for a control: ['turn']",
         ),
         (
             {"config": {"unlearn.method": "finetune"}},
-            "config.yaml: unlearn.method: found finetune, no control; accepted: distill, retrain",
+            "config.yaml: unlearn.method: found finetune; accepted for a control: distill or retrain",
         ),
         (
             {"config": {"unlearn.targets": ()}},
-            "config.yaml: unlearn.method: found distill, no control; accepted: distill, retrain",
+            "config.yaml: unlearn.method: found none; accepted for a control: distill or retrain",
         ),
         ({"episodes": 50}, "evaluation.json: episodes: found 50; accepted: 3, as in the unlearned run"),
         ({"seed": 1}, "evaluation.json: seed: found 1; accepted: 0, as in the unlearned run"),
@@ -203,7 +203,7 @@ def test_a_control_of_something_else_is_refused(refused, run, make_control, tmp_
 
 
 def test_the_run_itself_is_no_control(refused, run, tmp_path):
-    message = "config.yaml: unlearn.method: found arft, no control; accepted: distill, retrain"
+    message = "config.yaml: unlearn.method: found arft; accepted for a control: distill or retrain"
     assert refusal(refused, run, tmp_path, control=run) == message
 
 
@@ -286,8 +286,7 @@ def test_a_study_of_something_else_is_refused(refused, run, study, tmp_path):
         of["results"]["origins"]["starts"]["distilled"]["settings"]["sampling.clips"] = "all"
 
     assert refused_when(all_clips) == (
-        "results.origins.starts.distilled: sampling.clips: found all, so the control rolled out the targets; "
-        "accepted: kept"
+        "results.origins.starts.distilled: sampling.clips: found all; accepted for a control: kept"
     )
 
 
