@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from forgetmimic_jax.evaluation.membership import FALSE_POSITIVES, attack, features
+from forgetmimic_jax.evaluation.membership import FALSE_POSITIVES, attack_targets
 from forgetmimic_jax.evaluation.plots import bars, new_figure
 from forgetmimic_jax.evaluation.repeats import Repeat
 from forgetmimic_jax.evaluation.statistics import PlainEstimate
@@ -54,10 +54,9 @@ def measure(lab: Lab) -> dict[str, Any]:
     is_target = np.isin(next(iter(members.values())).clip, [names.index(target) for target in lab.targets])
     attacks: dict[str, dict[str, dict[str, float]]] = {}
     for key, rollout in members.items():
-        both = features(rollout, twins[key])
-        known, unknown = (tuple(values[mask] for values in both) for mask in (~is_target, is_target))
         label, repeat = key
-        attacks.setdefault(label, {})[str(repeat)] = dataclasses.asdict(attack(known, unknown))  # type: ignore[arg-type]
+        found = attack_targets(rollout, twins[key], is_target)
+        attacks.setdefault(label, {})[str(repeat)] = dataclasses.asdict(found)
     return {"policies": {label: estimates_of(found) for label, found in attacks.items()}}
 
 

@@ -18,7 +18,6 @@ def attack(case: Case) -> dict[str, Membership]:
     is_target = members.of(case.targets)
     found = {}
     for policy in case.policies:
-        both = membership.features(members.rollout(policy), twins.rollout(policy))
-        known, unknown = ((both[0][which], both[1][which]) for which in (~is_target, is_target))
-        found[policy] = Membership(**dataclasses.asdict(membership.attack(known, unknown)))
+        result = membership.attack_targets(members.rollout(policy), twins.rollout(policy), is_target)
+        found[policy] = Membership(**dataclasses.asdict(result))
     return found

@@ -54,6 +54,18 @@ def discriminant(members: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, f
     return direction, float(direction @ (members.mean(0) + others.mean(0)) / 2.0)
 
 
+def attack_targets(member: Rollout, twin: Rollout, is_target: np.ndarray) -> Attack:
+    """Learn from the kept clips and their mirror images, and classify the targets and theirs.
+
+    Args:
+        member: of the clips.
+        twin: of their mirror images; see `features`.
+        is_target: bool[E] the episodes of targets.
+    """
+    clips, images = features(member, twin)
+    return attack((clips[~is_target], images[~is_target]), (clips[is_target], images[is_target]))
+
+
 def attack(known: tuple[np.ndarray, np.ndarray], unknown: tuple[np.ndarray, np.ndarray]) -> Attack:
     """Learn from `known` (members, others), each f[E, feature], and classify the `unknown`."""
     direction, threshold = discriminant(*known)
