@@ -10,19 +10,16 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from forgetmimic_jax.attacks.performance import Performance
-from forgetmimic_jax.evaluation.rollout import CHUNK, Acting, act, begin_episodes, episode_starts, evaluation_setup
-from forgetmimic_jax.evaluation.side_by_side import squared_distance
+from forgetmimic_jax.evaluation.rollout import CHUNK, Acting, act, episode_starts, evaluation_setup, make_begin
+from forgetmimic_jax.evaluation.side_by_side import distances
 from forgetmimic_jax.motion.clip import Clip
 from forgetmimic_jax.motion.library import Frames, build_library
-from forgetmimic_jax.robot.model import Robot
 from forgetmimic_jax.tracking import env as tracking
-from forgetmimic_jax.tracking.env import Assets, EnvState, StepResult
-from forgetmimic_jax.tracking.reference import align_to_anchor
+from forgetmimic_jax.tracking.env import Assets, EnvState
 from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.tracking.stand import stand_frame
 
@@ -49,7 +46,7 @@ class Stage:
         self._seed = seed
         self._env = tracking.make_environment(setup, len(self.clip), noisy=False)
         self._assets, self._stand = tracking.make_assets(setup), stand_frame(setup.robot)
-        self._begin = jax.jit(self._begin_episodes)
+        self._begin = make_begin(self._env, self.clip, self.start_frame)
         self._advance = jax.jit(self._advance_chunk)
 
     def perform(self, policies: Mapping[str, Acting | None]) -> Performance:
@@ -84,10 +81,6 @@ class Stage:
         together = {name: np.concatenate([record[name] for record in records]).T for name in records[0]}
         return {"horizon": horizon} | {name: values[:, : int(horizon.max())] for name, values in together.items()}
 
-    def _begin_episodes(self, assets: Assets, key: Array) -> EnvState:
-        state = begin_episodes(self._env, assets, key, jnp.asarray(self.clip), jnp.asarray(self.start_frame))
-        return tracking.refresh_bodies(self._env, state, jnp.ones((self._env.num_envs,), bool))
-
     def _advance_chunk(self, assets: Assets, stand: Frames, policy: Acting | None, state: EnvState):
         env = self._env
 
@@ -95,24 +88,6 @@ class Stage:
             observation = tracking.observe(env, assets, state, None)[0]
             state, result = tracking.step(env, assets, state, act(env, policy, observation), key)
             record = {"terminated": result.terminated, "tracking": result.reward.normalized_tracking}
-            return state, record | distances(env.robot, stand, result)
+            return state, record | distances(env.robot, stand, result.pair)
 
         return jax.lax.scan(one_step, state, jax.random.split(jax.random.PRNGKey(0), CHUNK))
-
-
-def distances(robot: Robot, stand: Frames, result: StepResult) -> dict[str, Array]:
-    """How far the robot, and how far a stand, is from the reference after a step: each [env] m².
-
-    Args:
-        robot: whose bodies they are.
-        stand: the stand as one frame.
-        result: of the step.
-    """
-    pair, reference = result.pair, result.pair.reference.bodies
-    rows = len(pair.joint_pos)
-    standing = jax.tree.map(lambda values: jnp.broadcast_to(values, (rows, *values.shape)), stand)
-    there = align_to_anchor(standing, robot.anchor, reference.pos[:, robot.anchor], reference.quat[:, robot.anchor])
-    return {
-        "deviation": squared_distance(pair.bodies.pos, pair.aligned.pos),
-        "movement": squared_distance(there.pos, reference.pos),
-    }

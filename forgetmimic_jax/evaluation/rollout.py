@@ -7,6 +7,7 @@ so that every policy meets the same episodes.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import jax
@@ -51,7 +52,7 @@ class Evaluator:
             setup, len(self.clip), noisy=noise, runs_on=rule.runs_on, replace_reference=rule.replace_reference
         )
         self._assets = tracking.make_assets(setup)
-        self._begin = jax.jit(self._begin_episodes)
+        self._begin = make_begin(self._env, self.clip, self.start_frame)
         self._advance = jax.jit(self._advance_chunk)
 
     def start(self) -> EnvState:
@@ -97,10 +98,6 @@ class Evaluator:
             nan_resets=int(diverged.sum()),
         )
 
-    def _begin_episodes(self, assets: Assets, key: Array) -> EnvState:
-        state = begin_episodes(self._env, assets, key, jnp.asarray(self.clip), jnp.asarray(self.start_frame))
-        return tracking.refresh_bodies(self._env, state, jnp.ones((self._env.num_envs,), bool))
-
     def _advance_chunk(self, assets: Assets, policy: Acting | None, state: EnvState, begin: Array):
         env = self._env
 
@@ -126,6 +123,17 @@ def begin_episodes(env: Environment, assets: Assets, key: Array, clip: Array, fr
     zeros = jnp.zeros((env.num_envs,), jnp.int32)
     start = Start(clip.astype(jnp.int32), zeros, frame.astype(jnp.int32))
     return tracking.start_episodes(env, assets, key, start, zeros.astype(jnp.float32))
+
+
+def make_begin(env: Environment, clip: np.ndarray, frame: np.ndarray) -> Callable[[Assets, Array], EnvState]:
+    """The jitted begin(assets, key): episodes [env] at given clips and frames, with the bodies of the robots."""
+
+    @jax.jit
+    def begin(assets: Assets, key: Array) -> EnvState:
+        state = begin_episodes(env, assets, key, jnp.asarray(clip), jnp.asarray(frame))
+        return tracking.refresh_bodies(env, state, jnp.ones((env.num_envs,), bool))
+
+    return begin
 
 
 def act(env: Environment, policy: Acting | None, observation: Array) -> Array:

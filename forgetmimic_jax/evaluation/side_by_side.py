@@ -24,6 +24,7 @@ from forgetmimic_jax.robot.model import Robot
 from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.tracking.env import Assets, Environment, EnvState, StepResult
 from forgetmimic_jax.tracking.reference import align_to_anchor
+from forgetmimic_jax.tracking.reward import Pair
 from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.tracking.stand import low, stand_frame, tilted_unlike_clip
 
@@ -40,7 +41,7 @@ class Happened:
     torque_saturation: Values  # share of joints beyond 95 % of their torque limit
     joint_limit_violation: Values  # share of joints beyond their soft limits
     joint_speed_violation: Values  # share of joints faster than their motors
-    deviation: Values  # m², of the robot from the clip: see `squared_distance`
+    deviation: Values  # m², of the robot from the clip: see `distances`
     movement: Values  # m², of the stand from the clip
 
 
@@ -104,8 +105,6 @@ def happened(robot: Robot, stand: Frames, result: StepResult) -> Happened:
     pair, bodies = result.pair, result.pair.bodies
     assert isinstance(bodies, Impact)
     clip, joint_pos = pair.reference.bodies, pair.joint_pos
-    stands = jax.tree.map(lambda values: jnp.broadcast_to(values, (len(joint_pos), *values.shape)), stand)
-    stand_there = align_to_anchor(stands, robot.anchor, clip.pos[:, robot.anchor], clip.quat[:, robot.anchor])
     outside = (joint_pos < robot.arrays.soft_lower) | (joint_pos > robot.arrays.soft_upper)
     return Happened(
         fallen=low(robot, bodies) | tilted_unlike_clip(robot, bodies, clip) | result.diverged,
@@ -116,14 +115,28 @@ def happened(robot: Robot, stand: Frames, result: StepResult) -> Happened:
         torque_saturation=bodies.torque_saturation,
         joint_limit_violation=outside.mean(-1),
         joint_speed_violation=(jnp.abs(pair.joint_vel) > robot.joint_velocity_limit).mean(-1),
-        deviation=squared_distance(bodies.pos, pair.aligned.pos),
-        movement=squared_distance(stand_there.pos, clip.pos),
+        **distances(robot, stand, pair),
     )
 
 
-def squared_distance(one: Array, other: Array) -> Array:
-    """Mean over key bodies [env, key_body, 3] of the squared distance [env] m²; one is at the other's anchor."""
-    return ((one - other) ** 2).sum(-1).mean(-1)
+def distances(robot: Robot, stand: Frames, pair: Pair) -> dict[str, Array]:
+    """How far the robot (deviation), and how far a stand (movement), is from the reference, each [env] m².
+
+    It is the mean over key bodies of the squared distance, where one is moved to the other's anchor.
+
+    Args:
+        robot: whose bodies they are.
+        stand: the frame of its stand, without a leading dimension.
+        pair: the robot and the reference.
+    """
+    clip, rows = pair.reference.bodies, len(pair.joint_pos)
+    stands = jax.tree.map(lambda values: jnp.broadcast_to(values, (rows, *values.shape)), stand)
+    stand_there = align_to_anchor(stands, robot.anchor, clip.pos[:, robot.anchor], clip.quat[:, robot.anchor])
+
+    def apart(one: Array, other: Array) -> Array:
+        return ((one - other) ** 2).sum(-1).mean(-1)
+
+    return {"deviation": apart(pair.bodies.pos, pair.aligned.pos), "movement": apart(stand_there.pos, clip.pos)}
 
 
 def push(state: EnvState, velocity: Sequence[float] | np.ndarray) -> EnvState:
