@@ -137,8 +137,7 @@ def improve(run: Config, focus: Focus, state: TrainState, batch: Batch, rule: Ru
         return ((bound_std(actor), critic), optimizer_state, learning_rate), metrics
 
     def epoch(carry, key: Array):
-        indices = jax.random.permutation(key, size)[: size - size % config.minibatches]
-        return jax.lax.scan(minibatch, carry, indices.reshape(config.minibatches, -1))
+        return jax.lax.scan(minibatch, carry, shuffled(key, size, config.minibatches))
 
     key, epoch_key = jax.random.split(state.key)
     learning_rate = state.learning_rate
@@ -161,6 +160,12 @@ def improve(run: Config, focus: Focus, state: TrainState, batch: Batch, rule: Ru
         key=key,
     )
     return state, metrics
+
+
+def shuffled(key: Array, size: int, minibatches: int) -> Array:
+    """Indices [minibatch, n] of one epoch over `size` steps in random order; a remainder is left out."""
+    indices = jax.random.permutation(key, size)[: size - size % minibatches]
+    return indices.reshape(minibatches, -1)
 
 
 def learn_normalizers(state: TrainState, transition: Transition) -> TrainState:

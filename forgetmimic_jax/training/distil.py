@@ -22,6 +22,7 @@ from forgetmimic_jax.policy.normalizer import Normalizer
 from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.ppo.gae import generalized_advantages
 from forgetmimic_jax.ppo.state import make_optimizer
+from forgetmimic_jax.ppo.update import shuffled
 from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.tracking.env import Assets, Environment, EnvState
 from forgetmimic_jax.training.teaching import Lesson, Teaching, fresh_episodes, lesson_at
@@ -215,8 +216,7 @@ def learn(
         return (jax.tree.map(lambda p, u: p - step_size * u, parameters, updates), optimizer_state), metrics
 
     def epoch(carry, key: Array):
-        indices = jax.random.permutation(key, size)[: size - size % config.minibatches]
-        return jax.lax.scan(minibatch, carry, indices.reshape(config.minibatches, -1))
+        return jax.lax.scan(minibatch, carry, shuffled(key, size, config.minibatches))
 
     key, epoch_key = jax.random.split(state.key)
     carry = (state.student.parameters, state.optimizer)
