@@ -16,13 +16,11 @@ import msgspec
 import numpy as np
 
 from forgetmimic_jax.attacks.document import CONTROL, Compared, EvidenceDocument, Numbers, Relearning
-from forgetmimic_jax.evaluation.document import Estimate
 from forgetmimic_jax.evaluation.metrics import UNLEARNED
 from forgetmimic_jax.evaluation.relearning import DECISIVE, Lasted, lasted
-from forgetmimic_jax.evaluation.tables import FORGOTTEN, KEPT, KEPT_CLIP, number, percent
+from forgetmimic_jax.evaluation.tables import FORGOTTEN, KEPT, KEPT_CLIP, number
 from forgetmimic_jax.evaluation.verdict import (
     ALIKE,
-    BELOW,
     CONSISTENT,
     FAILED,
     FASTER,
@@ -31,6 +29,9 @@ from forgetmimic_jax.evaluation.verdict import (
     Skill,
     Verdict,
     as_skill,
+    below_baseline,
+    bound,
+    by_clip,
     losses,
     pace_over_seeds,
     retained,
@@ -43,18 +44,14 @@ RECOVERED = 0.1  # above the control, or above the policy before: a recovery of 
 Marks = Mapping[str, Compared]
 
 
-def _bound(share: float) -> str:
-    return percent(Estimate(mean=share))
-
-
 _FORGOTTEN = (
-    f"on every target and on every family of near-duplicates, the policy retains at most {_bound(FORGOTTEN)} of the "
-    f"base's skill, or at most {_bound(ALIKE)} more than the control does in the same episodes; the same holds for "
+    f"on every target and on every family of near-duplicates, the policy retains at most {bound(FORGOTTEN)} of the "
+    f"base's skill, or at most {bound(ALIKE)} more than the control does in the same episodes; the same holds for "
     f"motion content ({FORGOTTEN:g}, {ALIKE:g})"
 )
 _KEPT = (
-    f"it retains at least {_bound(KEPT_CLIP)} of the skill on every kept clip and {_bound(KEPT)} on average, and on "
-    f"every family of the kept clips' near-duplicates at least {_bound(KEPT_CLIP)}, or at most {_bound(ALIKE)} less "
+    f"it retains at least {bound(KEPT_CLIP)} of the skill on every kept clip and {bound(KEPT)} on average, and on "
+    f"every family of the kept clips' near-duplicates at least {bound(KEPT_CLIP)}, or at most {bound(ALIKE)} less "
     f"than the control"
 )
 _NO_SKILL = "The base itself is hardly better than the zero-action baseline on every {}: no skill is defined."
@@ -63,10 +60,10 @@ RULES = {
         f"Forgotten: {_FORGOTTEN}. Kept: {_KEPT}. Not recovered: fine-tuned on the kept clips alone, its skill and its "
         f"motion content on the targets are at most {RECOVERED:g} above the control's after the same training; with "
         f"other numerics at most {RECOVERED:g} above its own before; and with every seed it needs at least "
-        f"{_bound(FASTER)} of the control's target steps to relearn {_bound(DECISIVE)} of the base's tracking, or "
-        f"tracks at most {_bound(ALIKE)} of the base's more after the same target steps where neither gets there. All "
+        f"{bound(FASTER)} of the control's target steps to relearn {bound(DECISIVE)} of the base's tracking, or "
+        f"tracks at most {bound(ALIKE)} of the base's more after the same target steps where neither gets there. All "
         f"of this holds for whole 95 % intervals. The control never rolled out a target clip, and keeps at least "
-        f"{_bound(KEPT)} of the kept clips' skill."
+        f"{bound(KEPT)} of the kept clips' skill."
     ),
     RECOVERABLE: (
         "Not failed, but an attack brought the targets back: one of the three comparisons of 'not recovered' is on the "
@@ -124,9 +121,10 @@ def judge(evidence: EvidenceDocument) -> Verdict:
         return Verdict(RECOVERABLE, (*recovered, *doubts, *unsure, *remarks))
     if doubts or unsure:
         return Verdict(INCONCLUSIVE, (*doubts, *unsure, *remarks))
+    forgotten = by_clip(_skills(originals.targets))
     found = [
-        f"The targets and their near-duplicates are forgotten ({_by_clip(originals.targets)} of the base's skill), and "
-        f"the kept clips are kept ({retained(kept)} on average)."
+        f"The targets and their near-duplicates are forgotten ({forgotten} of the base's skill), and the kept clips "
+        f"are kept ({retained(kept)} on average)."
     ]
     return Verdict(CONSISTENT, (*found, *passed, *remarks))
 
@@ -208,8 +206,8 @@ def _pace(relearning: Relearning | None) -> tuple[bool | None, str]:
             continue
         ours, theirs = reached(relearning, seed)
         faster.append(ours > theirs + ALIKE)
-        short.append(f"{_bound(ours)} against {_bound(theirs)}")
-    words = f"{steps_in_words(pairs)} until {_bound(DECISIVE)} of the base's tracking"
+        short.append(f"{bound(ours)} against {bound(theirs)}")
+    words = f"{steps_in_words(pairs)} until {bound(DECISIVE)} of the base's tracking"
     words += f"; after the same target steps neither got there: {', '.join(short)}" if short else ""
     return pace_over_seeds(faster, words)
 
@@ -245,15 +243,14 @@ def _control_is_usable(evidence: EvidenceDocument) -> str:
     together = retained(kept)
     if together.low >= KEPT:
         return ""
-    return f"The control retains {together} of the kept clips' skill on average; a control needs {_bound(KEPT)}."
+    return f"The control retains {together} of the kept clips' skill on average; a control needs {bound(KEPT)}."
 
 
 def _over_forgotten(targets: Marks) -> list[str]:
-    """A doubt where a target is below the zero-action baseline: no retrained policy is."""
-    below = [f"{clip} {skill}" for clip, skill in _skills(targets).items() if skill.high < BELOW]
+    below = below_baseline(_skills(targets))
     if not below:
         return []
-    return [f"Over-forgotten: below the zero-action baseline ({', '.join(below)} of the base's skill)."]
+    return [f"Over-forgotten: below the zero-action baseline ({by_clip(below)} of the base's skill)."]
 
 
 def _remarks(evidence: EvidenceDocument) -> list[str]:
@@ -272,10 +269,6 @@ def _numbers(marks: Marks) -> Iterator[tuple[str, Numbers]]:
 def _skills(marks: Marks, policy: str = UNLEARNED) -> dict[str, Skill]:
     found = {name: as_skill(compared[policy].skill) for name, compared in marks.items() if policy in compared}
     return {name: skill for name, skill in found.items() if skill is not None}
-
-
-def _by_clip(marks: Marks) -> str:
-    return ", ".join(f"{clip} {skill}" for clip, skill in _skills(marks).items())
 
 
 def _words(kind: str, value: Skill) -> str:

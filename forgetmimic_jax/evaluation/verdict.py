@@ -31,23 +31,24 @@ BELOW = -0.005  # a skill that is less than 0 %, also when it is rounded: below 
 FASTER = 0.5  # relearning within this share of the control's target steps means that some skill was only hidden
 
 
-def _bound(share: float) -> str:
+def bound(share: float) -> str:
+    """A bound on a share, in words."""
     return percent(Estimate(mean=share))
 
 
 RULES = {
     CONSISTENT: (
-        f"Forgotten: on every target the policy retains at most {_bound(FORGOTTEN)} of the base's skill, and it is not "
-        f"below the zero-action baseline. Kept: it retains at least {_bound(KEPT_CLIP)} of the skill on every kept "
-        f"clip and at least {_bound(KEPT)} on average, a negative skill counting as 0. Like the control: on every "
-        f"target its skill is within {_bound(ALIKE)} of the base's from the control's. All of this holds for whole "
+        f"Forgotten: on every target the policy retains at most {bound(FORGOTTEN)} of the base's skill, and it is not "
+        f"below the zero-action baseline. Kept: it retains at least {bound(KEPT_CLIP)} of the skill on every kept "
+        f"clip and at least {bound(KEPT)} on average, a negative skill counting as 0. Like the control: on every "
+        f"target its skill is within {bound(ALIKE)} of the base's from the control's. All of this holds for whole "
         f"95 % intervals. Not faster to relearn: to reach 80 % of the base's tracking on the targets, it needs at "
-        f"least {_bound(FASTER)} of the target steps that the control needs, with every seed. The control is a policy "
+        f"least {bound(FASTER)} of the target steps that the control needs, with every seed. The control is a policy "
         f"that never rolled out a target clip: retrained or distilled on the kept clips alone."
     ),
     RECOVERABLE: (
-        f"Forgotten (at most {_bound(FORGOTTEN)} on every target) and kept as above, but with every seed the policy "
-        f"relearns the targets with less than {_bound(FASTER)} of the target steps that the control of that seed needs "
+        f"Forgotten (at most {bound(FORGOTTEN)} on every target) and kept as above, but with every seed the policy "
+        f"relearns the targets with less than {bound(FASTER)} of the target steps that the control of that seed needs "
         f"or is trained for."
     ),
     INCONCLUSIVE: (
@@ -55,8 +56,8 @@ RULES = {
         "differs from the control or is below the zero-action baseline (over-forgotten)."
     ),
     FAILED: (
-        f"With its whole 95 % interval, a target's retained skill is above {_bound(FORGOTTEN)}, a kept clip's is below "
-        f"{_bound(KEPT_CLIP)}, or the kept clips' average is below {_bound(KEPT)}."
+        f"With its whole 95 % interval, a target's retained skill is above {bound(FORGOTTEN)}, a kept clip's is below "
+        f"{bound(KEPT_CLIP)}, or the kept clips' average is below {bound(KEPT)}."
     ),
 }
 
@@ -123,7 +124,7 @@ def judge(
         return Verdict(FAILED if failures else INCONCLUSIVE, tuple(failures or doubts))
 
     found = [
-        f"On these episodes the targets are forgotten ({_by_clip(target)} of the base's skill retained) and the kept "
+        f"On these episodes the targets are forgotten ({by_clip(target)} of the base's skill retained) and the kept "
         f"clips are kept ({retained(kept)} on average)."
     ]
     undefined = [clip for clip in policies[UNLEARNED].clips if clip not in target | kept]
@@ -131,15 +132,15 @@ def judge(
         found.append(
             f"Not judged, since the base itself is hardly better than the zero-action baseline: {', '.join(undefined)}."
         )
-    below = {clip: skill for clip, skill in target.items() if skill.high < BELOW}
+    below = below_baseline(target)
     if below:
-        found.append(f"It is below the zero-action baseline: over-forgotten ({_by_clip(below)} of the base's skill).")
+        found.append(f"It is below the zero-action baseline: over-forgotten ({by_clip(below)} of the base's skill).")
 
     faster, pace = _relearning_pace(relearning)
     if faster:
         return Verdict(RECOVERABLE, (*found, pace))
     unlike = _unlike(target, control)
-    alike = f"On every target its skill is within {_bound(ALIKE)} of the control's."
+    alike = f"On every target its skill is within {bound(ALIKE)} of the control's."
     phrase = INCONCLUSIVE if unlike or below or faster is None else CONSISTENT
     return Verdict(phrase, (*found, unlike or alike, pace))
 
@@ -195,7 +196,13 @@ def losses(kept: Mapping[str, Skill]) -> tuple[list[str], list[str]]:
     return failures, doubts
 
 
-def _by_clip(skill: Mapping[str, Skill]) -> str:
+def below_baseline(target: Mapping[str, Skill]) -> dict[str, Skill]:
+    """The targets on which a policy is worse than the zero-action baseline: no retrained policy is."""
+    return {clip: skill for clip, skill in target.items() if skill.high < BELOW}
+
+
+def by_clip(skill: Mapping[str, Skill]) -> str:
+    """Each clip with its skill, in words."""
     return ", ".join(f"{clip} {of}" for clip, of in skill.items())
 
 
@@ -206,7 +213,7 @@ def _unlike(target: Mapping[str, Skill], control: PolicyResult | NotMeasured) ->
     theirs = skills(control, target=True)
     unlike = [clip for clip in target if clip not in theirs or _furthest(target[clip], theirs[clip]) > ALIKE]
     pairs = "; ".join(f"{clip}: {target[clip]} against {theirs.get(clip, 'none')}" for clip in unlike)
-    return f"Its skill may differ by more than {_bound(ALIKE)} from the control's: {pairs}." if unlike else ""
+    return f"Its skill may differ by more than {bound(ALIKE)} from the control's: {pairs}." if unlike else ""
 
 
 def _furthest(one: Skill, other: Skill) -> float:
