@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import numpy as np
 
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.motion.clip import Clip, default_name, validated
-from forgetmimic_jax.motion.comparing import BODY_DISTANCE
+from forgetmimic_jax.motion.comparing import BODY_DISTANCE, named_rate
 from forgetmimic_jax.motion.importing import FPS, import_motion
 from forgetmimic_jax.motion.kinematics import body_motion, configuration, tangent_steps
 from forgetmimic_jax.motion.recording import Reading
@@ -105,14 +104,12 @@ def _check_bodies(
 
 
 def clip_beside(motion: Path, fps: float | None, robot: Robot) -> Clip:
-    """The clip of a motion file as it is, at the control rate. A name such as dance_60hz.csv says its rate.
+    """The clip of a motion file as it is, at the control rate; without `fps`, read at the rate that its name says.
 
     Raises:
         InputError: the file does not say its rate, or is no motion of the robot.
     """
-    said = re.search(r"(\d+) ?(hz|fps)", motion.stem.lower())
-    rate = fps or (float(said[1]) if said else None)
-    return import_motion(robot, motion, Reading(fps=rate), keep_height=True).clip
+    return import_motion(robot, motion, Reading(fps=fps or named_rate(motion)), keep_height=True).clip
 
 
 def from_second(clip: Clip, start: float) -> Clip:

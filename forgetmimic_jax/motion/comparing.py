@@ -29,14 +29,19 @@ MOVING = 0.05  # rad/s, root mean square: below it velocities say nothing
 ALIKE = 0.8  # correlation of velocities with differences: below it they are something else
 
 
+def named_rate(path: Path) -> float | None:
+    """The rate that a file's name says, in frames per s, as that of dance_60hz.csv does."""
+    said = NAMED_RATE.search(path.name.lower())
+    return float(said[1] or said[2]) if said else None
+
+
 def check_rate(recording: Recording, clip: Clip, path: Path) -> str:
     """What the rate was compared with.
 
     Raises:
         InputError: the file's name, its velocities, or its own rate where they tell nothing, say another rate.
     """
-    said = NAMED_RATE.search(path.name.lower())
-    named = float(said[1] or said[2]) if said else None
+    named = named_rate(path)
     if named is not None and not _alike(named, clip.fps):
         flag = "" if recording.fps is not None and _alike(recording.fps, clip.fps) else f"give --fps {named:g}, or "
         raise InputError(
