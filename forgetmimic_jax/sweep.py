@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -12,14 +12,6 @@ import tyro
 from forgetmimic_jax.basics.errors import run_command
 from forgetmimic_jax.settings.options import parse
 from forgetmimic_jax.studies import options as study_options
-from forgetmimic_jax.studies import paper
-from forgetmimic_jax.studies.claim import Finding
-from forgetmimic_jax.studies.conduct import conduct
-from forgetmimic_jax.studies.findings import forgotten_and_kept, kept_stay, no_success, skill_gone
-from forgetmimic_jax.studies.penalty import penalty_study
-from forgetmimic_jax.studies.samplers import sampler_study
-from forgetmimic_jax.studies.study import Document, Study, variants_study
-from forgetmimic_jax.studies.targets import targets_study
 
 
 @dataclass(kw_only=True)
@@ -36,43 +28,26 @@ class Options(study_options.Options):
     """Folder for the JSON, the page and the figure; runs/sweep-ROBOT-KIND by default."""
 
 
-def seeds_study(_: tuple[str, ...] = ()) -> Study:
-    """The default run with several seeds."""
-    label = "λ = 16"
-
-    def findings(document: Document) -> Iterator[Finding]:
-        variants = document["results"]["variants"]
-        yield no_success(variants, label, "the targets are no longer completed", main=True)
-        yield from skill_gone(variants, label, "the skill on the targets is gone", main=True)
-        yield from kept_stay(variants, label, None, "the kept clips stay as they were", main=True)
-
-    return variants_study(
-        "seeds",
-        "The default run",
-        "The targets are forgotten and the other clips are kept.",
-        lambda lab: {label: {}},
-        findings=findings,
-        answer=lambda document: forgotten_and_kept(document["results"]["variants"]),
-        theirs=paper.VALIDITY,
-    )
-
-
-STUDIES: dict[str, Callable[..., Study]] = {
-    "lambda": penalty_study,
-    "targets": targets_study,
-    "sampler": sampler_study,
-    "seeds": seeds_study,
-}
-
-
 def main(options: Options) -> None:
     """Run the sweep."""
+    from forgetmimic_jax.studies.conduct import conduct
+    from forgetmimic_jax.studies.penalty import penalty_study
+    from forgetmimic_jax.studies.samplers import sampler_study
+    from forgetmimic_jax.studies.seeds import seeds_study
+    from forgetmimic_jax.studies.study import Study
+    from forgetmimic_jax.studies.targets import targets_study
     from forgetmimic_jax.training.start import base_folder
 
+    studies: dict[str, Callable[..., Study]] = {
+        "lambda": penalty_study,
+        "targets": targets_study,
+        "sampler": sampler_study,
+        "seeds": seeds_study,
+    }
     if not options.draw:
         options.bases = options.bases or str(base_folder(options.robot))
     options.output = options.output or Path("runs") / f"sweep-{options.robot}-{options.kind}"
-    make = STUDIES[options.kind]
+    make = studies[options.kind]
     conduct(make(tuple(options.values)) if options.values else make(), options, "make experiments")
 
 

@@ -11,7 +11,7 @@ from forgetmimic_jax import __main__ as program
 from forgetmimic_jax.settings.options import parse
 
 PACKAGE = Path(program.__file__).parent
-HEAVY = {"jax", "mujoco", "scipy", "matplotlib", "orbax"}  # what `--help` need not wait for
+HEAVY = {"numpy", "jax", "mujoco", "scipy", "matplotlib", "orbax"}  # what `--help` need not wait for
 
 
 def run(monkeypatch, *arguments: str) -> int:
