@@ -185,7 +185,7 @@ def _scale(options: Options) -> Scale:
 
 
 def _make_control(options: Options, info: CheckpointInfo, base: Path, folder: Path) -> None:
-    """Distil a control: with another seed than the run's, which may be distilled itself."""
+    """Make a control by the method distill: with another seed than the run's, which may be distilled itself."""
     from forgetmimic_jax.attacks import control
 
     given = {"method": control.METHOD, "iterations": options.control_iterations, "seed": info.config.seed + 1}

@@ -4,6 +4,8 @@ Every clip has a teacher. In a round the robots move, some by their teacher's ac
 at every state the teacher says what it would do, and the student's actor is regressed on that. The student's critic is
 regressed on the returns of the round. Everything that changes is in `DistilState`, one pytree: saved and restored, a
 distillation continues with the same bits.
+
+The unlearning method `distill` is something else: PPO of a fresh network with a KL to the base.
 """
 
 from __future__ import annotations
