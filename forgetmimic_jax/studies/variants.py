@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +13,7 @@ import numpy as np
 
 from forgetmimic_jax.basics.files import read_rows
 from forgetmimic_jax.evaluation import statistics
+from forgetmimic_jax.evaluation.document import FILE, Estimate, GroupResult, UnboundedNumbers, read_evaluation
 from forgetmimic_jax.evaluation.metrics import BASE, COMMON, LOWEST_CONTENT, ZERO_ACTION
 from forgetmimic_jax.evaluation.plots import bars, new_figure
 from forgetmimic_jax.evaluation.repeats import over_repeats
@@ -54,17 +54,14 @@ def summary(folder: Path) -> dict[str, Any]:
     with `lambda_crit`, the threshold on target steps in the first iteration, whose steps are the base's own, and
     `target_step_share`, the share of all training steps that were on targets.
     """
-    document = json.loads((folder / "evaluation.json").read_text())
     result: dict[str, Any] = {}
-    for name, policy in document["policies"].items():
-        groups = {
-            group: {**_means(policy[group]), EPISODES: policy[group]["success_rate"]["n"]}
-            for group in ("target", "kept")
-            if group in policy
+    for name, policy in read_evaluation(folder / FILE).policies.items():
+        groups = {"target": policy.target, "kept": policy.kept}
+        result[name if name in (BASE, ZERO_ACTION) else "policy"] = {
+            **{group: _numbers(numbers) for group, numbers in groups.items() if numbers},
+            "clips": {clip: numbers.survival_weighted_tracking.mean for clip, numbers in policy.clips.items()},
+            **_means({ratio: getattr(policy, ratio) for ratio in RATIOS}),
         }
-        clips = {clip: metrics[TRACKING]["mean"] for clip, metrics in policy["clips"].items()}
-        ratios = {ratio: policy[ratio]["mean"] for ratio in RATIOS if "mean" in policy.get(ratio, {})}
-        result[name if name in (BASE, ZERO_ACTION) else "policy"] = {**groups, "clips": clips, **ratios}
     rows = read_rows(folder / "metrics.jsonl")
     if rows and "target/lambda_crit" in rows[0]:
         result["lambda_crit"] = rows[0]["target/lambda_crit"]
@@ -106,9 +103,14 @@ def paired(
     return {repeat: (mine[repeat], theirs[repeat]) for repeat in mine if repeat in theirs}
 
 
-def _means(metrics: Mapping[str, Any]) -> dict[str, float]:
-    every = {**metrics, **metrics.get("unbounded", {}).get("all_starts", {})}
-    return {name: every[name]["mean"] for name in (*METRICS, *UNBOUNDED) if "mean" in every.get(name, {})}
+def _numbers(group: GroupResult) -> dict[str, float]:
+    unbounded = group.unbounded.all_starts if group.unbounded else UnboundedNumbers()
+    found = {name: group.metric(name) for name in METRICS} | {name: getattr(unbounded, name) for name in UNBOUNDED}
+    return {**_means(found), EPISODES: group.success_rate.n}
+
+
+def _means(numbers: Mapping[str, Estimate | None]) -> dict[str, float]:
+    return {name: of.mean for name, of in numbers.items() if of is not None and of.mean is not None}
 
 
 def estimates_of(runs: Mapping[str, Any]) -> Any:

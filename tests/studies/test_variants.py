@@ -1,4 +1,5 @@
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -66,21 +67,30 @@ def test_a_difference_is_between_runs_of_the_same_repeat(variants):
     assert gained(of, "λ = 16", "gone", "target", "success_rate") == {}
 
 
+NUMBERS = ("success_rate", "survival_weighted_tracking", "tracking_reward", "episode_length")
+
+
+def write(folder: Path, policies: dict) -> None:
+    """An evaluation.json of policies."""
+    names = dict.fromkeys(("robot", "checkpoint", "config_hash", "library_hash"), "")
+    document = {"schema": 1, "seed": 0, "episodes": 6, "targets": [], **names, "policies": policies}
+    (folder / "evaluation.json").write_text(json.dumps(document))
+
+
 def test_a_trials_summary_has_the_means_that_tables_and_figures_read(tmp_path):
     def policy(value: float) -> dict:
-        metrics = {name: {"mean": value, "low": 0.0, "n": 6} for name in ("success_rate", "survival_weighted_tracking")}
-        metrics["mpkpe"] = {"mean": 1.0}
-        return {"clips": {"run": metrics}, "target": metrics, "kept": metrics, "degradation_ratio": {"mean": 2 * value}}
+        metrics = {name: {"mean": value, "low": 0.0, "n": 6} for name in NUMBERS} | {"mpkpe": {"mean": 1.0}}
+        groups = {"clips": {"run": {"target": False, **metrics}}, "target": metrics, "kept": metrics}
+        return {**groups, "degradation_ratio": {"mean": 2 * value}, "nan_resets": 0}
 
-    policies = {"base": policy(0.9), "unlearned": policy(0.1), "zero_action": policy(0.0)}
-    (tmp_path / "evaluation.json").write_text(json.dumps({"policies": policies}))
+    write(tmp_path, {"base": policy(0.9), "unlearned": policy(0.1), "zero_action": policy(0.0)})
     rows = [
         {"environment_steps": 10, "target/step_share": 0.5, "target/lambda_crit": 7.5},
         {"environment_steps": 40, "target/step_share": 0.1, "target/lambda_crit": 7.9},
     ]
     (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     found = summary(tmp_path)
-    group = {"success_rate": 0.1, "survival_weighted_tracking": 0.1, "episodes": 6}
+    group = dict.fromkeys(NUMBERS, 0.1) | {"episodes": 6}
     assert found["policy"] == {"target": group, "kept": group, "clips": {"run": 0.1}, "degradation_ratio": 0.2}
     assert found["lambda_crit"] == 7.5
     assert found["target_step_share"] == pytest.approx((10 * 0.5 + 30 * 0.1) / 40)
@@ -111,11 +121,10 @@ def test_numbers_without_terminations_are_columns_which_are_empty_where_a_trial_
 
 
 def test_a_trials_summary_has_the_numbers_without_terminations(tmp_path):
-    group = {"success_rate": {"mean": 0.5, "n": 6}, "survival_weighted_tracking": {"mean": 0.5}}
+    group = {name: {"mean": 0.5, "n": 6} for name in NUMBERS}
     every = {name: {"mean": mean, "n": 6} for name, mean in (("upright_rate", 0.5), ("motion_content", 0.1))}
     target = {**group, "unbounded": {"all_starts": every, "from_frame_0": {"upright_rate": {"mean": 1.0}}}}
-    policies = {"unlearned": {"clips": {}, "target": target, "kept": group}}
-    (tmp_path / "evaluation.json").write_text(json.dumps({"policies": policies}))
+    write(tmp_path, {"unlearned": {"clips": {}, "target": target, "kept": group, "nan_resets": 0}})
     (tmp_path / "metrics.jsonl").write_text("")
     found = summary(tmp_path)["policy"]
     assert (found["target"]["upright_rate"], found["target"]["motion_content"]) == (0.5, 0.1)
