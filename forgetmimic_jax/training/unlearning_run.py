@@ -9,10 +9,20 @@ import dataclasses
 import itertools
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from forgetmimic_jax.basics.errors import InputError
-from forgetmimic_jax.settings.config import Config, EngineName, Preset, UnlearnConfig, WrenchConfig, load_config, preset
+from forgetmimic_jax.settings.config import (
+    Config,
+    EngineName,
+    PPOConfig,
+    Preset,
+    SamplingConfig,
+    UnlearnConfig,
+    WrenchConfig,
+    load_config,
+    preset,
+)
 from forgetmimic_jax.settings.interface import with_interface
 from forgetmimic_jax.settings.options import (
     Settings,
@@ -22,6 +32,10 @@ from forgetmimic_jax.settings.options import (
     override,
     replace_given,
 )
+
+if TYPE_CHECKING:
+    from forgetmimic_jax.training.checkpoint import CheckpointInfo
+    from forgetmimic_jax.unlearning.method import Pace
 
 
 @dataclass
@@ -103,23 +117,38 @@ def config_of_new_run(options: Options) -> Config:
     settings = {} if options.penalty is None else {"penalty": options.penalty}
     config = unlearning_config(config, UnlearnConfig(targets, options.method, settings))
     method = find_method(options.method)
-    pace, stop_every = method.pace, 0 if options.no_stop else method.stop_every
-    config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, **pace.ppo.get(config.preset, {})))
-    sampling = replace_given(config.sampling, rule=options.sampler, clips=options.clips)
-    if (sampling.rule, sampling.clips) == ("uniform_clips", "all"):  # the other samplers' shares are their own
-        share = pace.target_share.get(config.preset, 0.0)
-        sampling = dataclasses.replace(sampling, target_share=share, first_frame=pace.first_frame)
-    wrench = config.wrench
-    if options.wrench:
-        wrench = dataclasses.replace(wrench, max_gain=info.config.wrench.max_gain or WrenchConfig.max_gain)
+    ppo = dataclasses.replace(config.ppo, **method.pace.ppo.get(config.preset, {}))
+    return dataclasses.replace(
+        config,
+        iterations=_iterations(options, info, method.pace, ppo),
+        ppo=ppo,
+        sampling=_sampling(options, config, method.pace),
+        wrench=_wrench(config, info) if options.wrench else config.wrench,
+        unlearn=dataclasses.replace(config.unlearn, stop_every=0 if options.no_stop else method.stop_every),
+    )
+
+
+def _iterations(options: Options, info: CheckpointInfo, pace: Pace, ppo: PPOConfig) -> int:
+    """The method's, or without such a number as many steps as the base was trained for."""
     if pace.iterations:
-        iterations = pace.iterations[options.preset or "cpu"]
-    elif info.environment_steps or options.iterations:
-        iterations = max(1, round(info.environment_steps / (config.ppo.num_envs * config.ppo.num_steps)))
-    else:
+        return pace.iterations[options.preset or "cpu"]
+    if not info.environment_steps and not options.iterations:
         raise InputError(f"--iterations: {info.path} does not say how long it was trained; say how long to retrain")
-    unlearn = dataclasses.replace(config.unlearn, stop_every=stop_every)
-    return dataclasses.replace(config, iterations=iterations, sampling=sampling, wrench=wrench, unlearn=unlearn)
+    return max(1, round(info.environment_steps / (ppo.num_envs * ppo.num_steps)))
+
+
+def _sampling(options: Options, config: Config, pace: Pace) -> SamplingConfig:
+    """The flags' sampler and clips; the method's shares of the starts, unless the sampler has shares of its own."""
+    sampling = replace_given(config.sampling, rule=options.sampler, clips=options.clips)
+    if (sampling.rule, sampling.clips) != ("uniform_clips", "all"):
+        return sampling
+    share = pace.target_share.get(config.preset, 0.0)
+    return dataclasses.replace(sampling, target_share=share, first_frame=pace.first_frame)
+
+
+def _wrench(config: Config, info: CheckpointInfo) -> WrenchConfig:
+    """As strong as the base's training had it, or where that had none, as strong as the paper's."""
+    return dataclasses.replace(config.wrench, max_gain=info.config.wrench.max_gain or WrenchConfig.max_gain)
 
 
 def _on_preset(base: Config, name: str) -> Config:
