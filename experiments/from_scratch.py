@@ -101,7 +101,7 @@ def findings(document: Document) -> Iterator[Finding]:
     for name, (one, other) in PAIRS.items():
         more = {metric: gained(document, one, other, metric) for metric in (TRACKING, SUCCESS)}
         if more[TRACKING]:
-            tracking, success = (over_repeats(of) for of in more.values())
+            tracking, success = over_repeats(more[TRACKING]), over_repeats(more[SUCCESS])
             evidence = f"tracking with it minus without {number(tracking)}, success {percent(success)}; bound 0"
             yield finding(f"{name} helps a training from scratch", tracking, 0.0, evidence, below=False, main=True)
 

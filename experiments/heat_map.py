@@ -37,10 +37,9 @@ def measure(lab: Lab) -> dict[str, Any]:
         shown = [{clip: {name: of[name] for name in SHOWN} for clip, of in at.items()} for at in clips]
         columns[str(repeat)], groups[str(repeat)] = shown, [group_means(at, lab.targets) for at in shown]
         iterations = [0, *(row["iteration"] for row in rows)]
-    checkpoints, means = (
-        [estimates_of({repeat: column[place] for repeat, column in of.items()}) for place in range(len(iterations))]
-        for of in (columns, groups)
-    )
+    places = range(len(iterations))
+    checkpoints = [estimates_of({repeat: column[place] for repeat, column in columns.items()}) for place in places]
+    means = [estimates_of({repeat: column[place] for repeat, column in groups.items()}) for place in places]
     return {"iterations": iterations, "checkpoints": checkpoints, "groups": means}
 
 

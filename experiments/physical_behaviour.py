@@ -129,7 +129,7 @@ def findings(document: Document) -> Iterator[Finding]:
     policies = document["results"]["policies"]
     if UNLEARNED not in policies:
         return
-    length, baseline = (over_runs(policies, label, LENGTH) for label in (UNLEARNED, ZERO))
+    length, baseline = over_runs(policies, UNLEARNED, LENGTH), over_runs(policies, ZERO, LENGTH)
     evidence = f"target episodes last {number(length, 1)} steps; bound {baseline['mean'] - SOONER:.1f}, one less than "
     claim = f"{UNLEARNED}: target episodes end no sooner than the zero-action baseline's"
     bound = baseline["mean"] - SOONER

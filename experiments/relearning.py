@@ -128,7 +128,7 @@ def curve_of(
         targets: clips.
         at_first: the policy that the run started from, clip by clip, on the same episodes; None for a fresh one.
     """
-    rows, log = (read_rows(folder / name) for name in ("evaluations.jsonl", "metrics.jsonl"))
+    rows, log = read_rows(folder / "evaluations.jsonl"), read_rows(folder / "metrics.jsonl")
     on_target = np.diff([0, *(row["environment_steps"] for row in log)]) * [row["target/step_share"] for row in log]
     counted = ([0, *(row["iteration"] for row in log)], [0.0, *np.cumsum(on_target)])
     start = [] if at_first is None else [(0, _tracking(at_first, targets), 0.0)]
@@ -194,7 +194,7 @@ def answer(document: Document) -> str:
 
 def _no_sooner(results: Mapping[str, Any], control: str, level: float) -> Finding:
     """The unlearned policy needs no fewer target steps than a control until a share `level` of the base."""
-    mine, theirs = (lasted(results, label, level) for label in ("unlearned", control))
+    mine, theirs = lasted(results, "unlearned", level), lasted(results, control, level)
     both = [repeat for repeat in mine if repeat in theirs]
     claim = f"{share(level)} of the tracking comes back after no fewer target steps than a {control} policy needs"
     more = over_repeats({at: mine[at].target_steps - theirs[at].target_steps for at in both})

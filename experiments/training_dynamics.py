@@ -99,7 +99,8 @@ def findings(document: Document) -> Iterator[Finding]:
             claim = f"{label}: {words} {'rises' if rises else 'falls'}"
             yield finding(claim, difference(last, first), 0.0, evidence, below=not rises, main=is_main)
     if B in configurations:
-        first, last = (configurations[B]["rows"][place]["target/R_anti"] for place in (0, -1))
+        rows = configurations[B]["rows"]
+        first, last = rows[0]["target/R_anti"], rows[-1]["target/R_anti"]
         bound = FORGOTTEN * first["mean"]
         evidence = f"R_anti a target step {number(last, 2)}; bound {bound:.2f}, a fifth of the first"
         yield finding(f"{B}: the targets' anti-reward goes to nothing", last, bound, evidence, below=False)

@@ -190,7 +190,7 @@ def compared(commit: str, options: Options) -> dict[str, Any]:
                     sides[name].append(_figures_of(root, Path(folder) / "figures.json", options))
         finally:
             _git(checkout, ["worktree", "remove", "--force", str(other)], commit)
-    this, that = (_medians(sides[name]) for name in ("this", "other"))
+    this, that = _medians(sides["this"]), _medians(sides["other"])
     over = {name: value / that[name] for name, value in this.items() if that.get(name)}
     return {"this": this, "other": that, "over": over}
 

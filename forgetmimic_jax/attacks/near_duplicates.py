@@ -157,7 +157,8 @@ def as_high(robot: Robot, variant: Clip, clip: Clip) -> Clip:
 
     The lowest fifth of the frames' lowest sole points decides.
     """
-    ours, theirs = (np.quantile(lowest_points(robot, one, soles=True), 0.2) for one in (clip, variant))
+    ours = np.quantile(lowest_points(robot, clip, soles=True), 0.2)
+    theirs = np.quantile(lowest_points(robot, variant, soles=True), 0.2)
     return dataclasses.replace(variant, root_pos=variant.root_pos + np.array([0.0, 0.0, ours - theirs]))
 
 

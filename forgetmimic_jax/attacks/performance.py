@@ -67,9 +67,8 @@ class Performance:
         steps = np.arange(self.movement.shape[1])
         inside = (steps >= first[:, None]) & (steps < np.minimum(end, self.horizon)[:, None])
         count = np.maximum(inside.sum(axis=1), 1)
-        movement, deviation = (
-            np.where(inside, values, 0.0).sum(axis=1) / count for values in (self.movement, self.deviation[policy])
-        )
+        movement = np.where(inside, self.movement, 0.0).sum(axis=1) / count
+        deviation = np.where(inside, self.deviation[policy], 0.0).sum(axis=1) / count
         moves = movement >= SMALLEST_MOVEMENT**2
         return np.maximum(1.0 - deviation / np.where(moves, movement, np.nan), LOWEST_CONTENT)
 

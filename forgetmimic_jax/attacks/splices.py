@@ -113,7 +113,8 @@ def attack(case: Case) -> Splices:
     originals = {one.clip.name: host for one, host in zip(every, hosts, strict=True)}
     dropped = not_followed(performance, case.on_library, originals, FOLLOWED)
     # The step t tracks the frame t + 1.
-    first, end = (np.array(ends)[performance.clip] - 1 for ends in zip(*((s.first, s.end) for s in every), strict=True))
+    first = np.array([one.first for one in every])[performance.clip] - 1
+    end = np.array([one.end for one in every])[performance.clip] - 1
 
     def compared(splices: list[Splice]) -> Compared:
         members = performance.of([one.clip.name for one in splices if one.clip.name not in dropped])

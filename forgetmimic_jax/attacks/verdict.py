@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping
 import msgspec
 import numpy as np
 
-from forgetmimic_jax.attacks.document import CONTROL, Compared, EvidenceDocument, Numbers, Relearning
+from forgetmimic_jax.attacks.document import CONTROL, Compared, Curve, EvidenceDocument, Numbers, Relearning
 from forgetmimic_jax.evaluation.metrics import UNLEARNED
 from forgetmimic_jax.evaluation.relearning import DECISIVE, Lasted, lasted
 from forgetmimic_jax.evaluation.tables import FORGOTTEN, KEPT, KEPT_CLIP, number
@@ -217,10 +217,13 @@ def reached(relearning: Relearning, seed: str) -> tuple[float, float]:
 
     Both are taken where the shorter of the two trainings ended.
     """
-    curves = [relearning.starts[start][seed] for start in (UNLEARNED, CONTROL)]
-    end = min(curve.target_steps[-1] for curve in curves)
-    ours, theirs = (np.interp(end, curve.target_steps, curve.tracking) / relearning.base[seed] for curve in curves)
-    return float(ours), float(theirs)
+    ours, theirs = relearning.starts[UNLEARNED][seed], relearning.starts[CONTROL][seed]
+    end = min(ours.target_steps[-1], theirs.target_steps[-1])
+
+    def share(curve: Curve) -> float:
+        return float(np.interp(end, curve.target_steps, curve.tracking) / relearning.base[seed])
+
+    return share(ours), share(theirs)
 
 
 def paired(relearning: Relearning) -> dict[str, tuple[Lasted, Lasted]]:

@@ -69,7 +69,7 @@ def attack_targets(member: Rollout, twin: Rollout, is_target: np.ndarray) -> Att
 def attack(known: tuple[np.ndarray, np.ndarray], unknown: tuple[np.ndarray, np.ndarray]) -> Attack:
     """Learn from `known` (members, others), each f[E, feature], and classify the `unknown`."""
     direction, threshold = discriminant(*known)
-    members, others = (values @ direction for values in unknown)
+    members, others = unknown[0] @ direction, unknown[1] @ direction
     accuracy = 0.5 * ((members > threshold).mean() + (others <= threshold).mean())
     strict = np.sort(others)[-1 - int(FALSE_POSITIVES * len(others))]
     return Attack(float(accuracy), auc(members, others), float((members > strict).mean()))

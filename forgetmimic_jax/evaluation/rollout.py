@@ -71,7 +71,7 @@ class Evaluator:
         records = []
         for begin in range(0, int(horizon.max()), CHUNK):
             state, record = jax.device_get(self._advance(self._assets, policy, state, begin))
-            terminated, blew_up, broken = (record.pop(name) for name in ("terminated", "diverged", "causes"))
+            terminated, blew_up, broken = record.pop("terminated"), record.pop("diverged"), record.pop("causes")
             records.append(record)
             for offset in range(CHUNK):
                 now = terminated[offset] & ~ended & (begin + offset < horizon)

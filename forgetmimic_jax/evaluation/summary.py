@@ -115,7 +115,7 @@ def _episodes_summary(
 
     n = len(success)
     if ZERO_ACTION in per_policy:
-        base, zero = (np.mean(tracking(name)[0]) for name in (BASE, ZERO_ACTION))
+        base, zero = np.mean(tracking(BASE)[0]), np.mean(tracking(ZERO_ACTION)[0])
         if base - zero >= metrics.MINIMUM_SKILL_RANGE:
             against = (tracking(policy), tracking(BASE), tracking(ZERO_ACTION))
             summary["skill"] = statistics.bootstrap_of_means(metrics.skill, *against, n=n)

@@ -87,7 +87,8 @@ def episode_numbers(rollout: UnboundedRollout) -> dict[str, np.ndarray]:
     """
     happened = rollout.happened
     steps = np.arange(happened.fallen.shape[1])
-    during, of_clip = (steps < end[:, None] for end in (rollout.steps, rollout.horizon))
+    during = steps < rollout.steps[:, None]
+    of_clip = steps < rollout.horizon[:, None]
 
     def largest(values: np.ndarray) -> np.ndarray:
         return np.where(during, values, 0).max(axis=1).astype(float)

@@ -111,7 +111,8 @@ def judge(
         relearning: by seed, how long the unlearned policy and the control took until 80 % of the base's tracking on the
             targets.
     """
-    target, kept = (skills(policies[UNLEARNED], target=is_target) for is_target in (True, False))
+    target = skills(policies[UNLEARNED], target=True)
+    kept = skills(policies[UNLEARNED], target=False)
     for what, skill in (("targets", target), ("kept clips", kept)):
         if not skill:
             none = f"The base itself is hardly better than the zero-action baseline on the {what}: no skill is defined."
@@ -119,7 +120,9 @@ def judge(
     without = [clip for clip, skill in (target | kept).items() if skill.high == inf]
     if without:
         return Verdict(INCONCLUSIVE, (f"Too few episodes for an interval: {', '.join(without)}.",))
-    failures, doubts = (one + other for one, other in zip(_forgotten(target), losses(kept), strict=True))
+    known, perhaps_known = _forgotten(target)
+    lost, perhaps_lost = losses(kept)
+    failures, doubts = known + lost, perhaps_known + perhaps_lost
     if failures or doubts:
         return Verdict(FAILED if failures else INCONCLUSIVE, tuple(failures or doubts))
 

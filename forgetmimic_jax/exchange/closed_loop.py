@@ -60,7 +60,7 @@ def run_episodes(
     """
     numbers = range(len(library.names))
     references = [jax.tree.map(lambda values: values.astype(np.float64), library.clip(number)) for number in numbers]
-    clips, frames, horizons = (np.asarray(x) for x in (start.clip, start.frame, start.horizon))
+    clips, frames, horizons = np.asarray(start.clip), np.asarray(start.frame), np.asarray(start.horizon)
     deployed = Deployed(actor, robot)
     episodes: list[dict[str, np.ndarray]] = []
     for clip, frame, horizon, qpos, qvel in zip(

@@ -122,10 +122,11 @@ def describe(facts: Mapping[str, Fact], robot: Robot, step_dt: float, policy: Pa
     own = "the robot's" if order == robot.joint_names else f"another: {', '.join(order[:3])} …"
     rows.append(_row("joint order", own, facts, "joint_names", "the robot's order"))
     # What the action is added to is our default pose; the joint angles that the policy sees are less its own.
-    pose, offset = (facts[key].value if key in facts else None for key in ("default_joint_pos", "action_offset"))
+    values = {key: fact.value for key, fact in facts.items()}
+    pose, offset = values.get("default_joint_pos"), values.get("action_offset")
     tables = {"default_pose": offset if offset and mode == "offset" else pose}
     names = {"scale": "action_scale", "stiffness": "joint_stiffness", "damping": "joint_damping"}
-    tables |= {name: facts[key].value if key in facts else None for name, key in names.items()}
+    tables |= {name: values.get(key) for name, key in names.items()}
     for name, key in {"default_pose": "default_joint_pos", **names}.items():
         own = "the robot's own" if tables[name] is None else "the action's offset"
         rows.append(_row(name.replace("_", " "), _compared(tables[name], robot, name), facts, key, own))

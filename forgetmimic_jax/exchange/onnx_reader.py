@@ -114,7 +114,8 @@ def _actor(chain: _Chain, path: Path) -> ImportedActor:
         return ImportedActor(tuple(layers))
     features = len(layers[0][0])
     with np.errstate(all="ignore"):
-        mean, divisor = (np.array(np.broadcast_to(x, features), np.float32) for x in (-shift / scale, 1.0 / scale))
+        mean = np.array(np.broadcast_to(-shift / scale, features), np.float32)
+        divisor = np.array(np.broadcast_to(1.0 / scale, features), np.float32)
     return ImportedActor(tuple(layers), mean=mean, scale=divisor)
 
 

@@ -89,10 +89,8 @@ def try_out(setup: Setup, policy: Policy, *, episodes: int, seed: int) -> Trial:
 def _start(env: Environment, assets: Assets, key: Array, clip: np.ndarray, frame: np.ndarray, clean: np.ndarray):
     """Episodes with reset noise, and where `clean` without it, to the clip's end."""
     still = dataclasses.replace(env.config, noise=_without_resets(env.config.noise), max_episode_steps=LONGEST)
-    noisy, exact = (
-        begin_episodes(one, assets, key, jnp.asarray(clip), jnp.asarray(frame))
-        for one in (env, dataclasses.replace(env, config=still))
-    )
+    noisy = begin_episodes(env, assets, key, jnp.asarray(clip), jnp.asarray(frame))
+    exact = begin_episodes(dataclasses.replace(env, config=still), assets, key, jnp.asarray(clip), jnp.asarray(frame))
     mask = jnp.asarray(clean)
     state: EnvState = jax.tree.map(lambda a, b: jnp.where(mask.reshape(-1, *[1] * (a.ndim - 1)), a, b), exact, noisy)
     return tracking.refresh_bodies(env, state, jnp.ones_like(mask))

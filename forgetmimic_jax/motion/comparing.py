@@ -92,7 +92,8 @@ def _told_by_velocities(recording: Recording, fps: float, path: Path) -> tuple[s
     differences, velocities = rate(recording.joint_pos, fps)[finite], recording.joint_vel[finite]
     if not np.any(velocities):
         return None, "joint_vel is zero or NaN in every frame"
-    moves, moved = (float(np.sqrt(np.mean(values**2))) for values in (differences, velocities))
+    moves = float(np.sqrt(np.mean(differences**2)))
+    moved = float(np.sqrt(np.mean(velocities**2)))
     if moves < MOVING:
         return None, "the joints hardly move"
     product = float(np.mean(differences * velocities))

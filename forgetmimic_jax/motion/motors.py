@@ -92,7 +92,7 @@ class InverseDynamics:
 
     def derivatives(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Of the last motion's force by its position, velocity and acceleration: [nv, nv] each."""
-        position, velocity, acceleration = (np.zeros((self._model.nv, self._model.nv)) for _ in range(3))
+        position, velocity, acceleration = np.zeros((3, self._model.nv, self._model.nv))
         nothing = (None,) * 4
         mujoco.mjd_inverseFD(self._model, self._data, STEP, False, position, velocity, acceleration, *nothing)
         return position.T, velocity.T, acceleration.T

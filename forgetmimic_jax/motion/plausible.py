@@ -94,7 +94,8 @@ def doubt_of(robot: Robot, clip: Clip) -> Doubt:
     first = np.unique(np.linspace(0, clip.num_frames - 1 - apart, PAIRS).astype(int))
     qpos = configuration(clip, robot)
     points = floor_points(robot)
-    now, after = (floor_positions(robot, points, qpos[rows]) for rows in (first, first + apart))
+    now = floor_positions(robot, points, qpos[first])
+    after = floor_positions(robot, points, qpos[first + apart])
     lowest = now[..., 2].min(axis=1)
     level = float(np.quantile(lowest, 0.2))
     speed = np.linalg.norm(after[..., :2] - now[..., :2], axis=-1) * clip.fps / apart

@@ -41,7 +41,7 @@ def check_jumps(clip: Clip, first: int, path: Path) -> None:
     turns = rotation(clip.root_quat)
     steps = np.diff(clip.root_pos, axis=0) * clip.fps
     spins = (turns[1:] * turns[:-1].inv()).as_rotvec() * clip.fps
-    jumps, whirls = (_difference(values, clip.fps) for values in (steps, spins))
+    jumps, whirls = _difference(steps, clip.fps), _difference(spins, clip.fps)
     bad = np.flatnonzero((jumps > JUMP) | (whirls > WHIRL))
     if not len(bad):
         return

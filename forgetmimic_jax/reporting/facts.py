@@ -96,7 +96,8 @@ def instead(subject: Subject) -> str:
         if target is None or target.unbounded is None:
             return ""
         found = target.unbounded.all_starts
-        upright, impact = (percent(rate, interval=False) or "none" for rate in (found.upright_rate, found.impact_rate))
+        upright = percent(found.upright_rate, interval=False) or "none"
+        impact = percent(found.impact_rate, interval=False) or "none"
         content = number(found.motion_content, 2, interval=False) or "undefined"
         sentences.append(
             f"With {who} the robot stands until the end in {upright} of the targets' episodes, a body other than the "

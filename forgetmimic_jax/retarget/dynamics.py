@@ -38,7 +38,7 @@ def floor_wrench(robot: Robot, timeline: Timeline, pose: Pose, flight: np.ndarra
     second = (first + 1) % timeline.frames
     between_second = timeline.vectors(between, first, 1)
 
-    com_1, com_2 = (timeline.positions(pose.com, first, ahead) for ahead in (1, 2))
+    com_1, com_2 = timeline.positions(pose.com, first, 1), timeline.positions(pose.com, first, 2)
     force = (com_2 - 2.0 * com_1 + pose.com[first]) * fps**2 - GRAVITY
     spin_second = np.einsum("tij,tj->ti", between_second, change[second])
     spin_first = np.einsum("tij,tj->ti", between[first], change[first])
@@ -47,7 +47,7 @@ def floor_wrench(robot: Robot, timeline: Timeline, pose: Pose, flight: np.ndarra
     touching = (points[..., 2] < TOUCHING) & ~flight[second, None]
     given, project = floor_answer(needed, points - com_1[:, None], touching)
 
-    jac_1, jac_2 = (timeline.vectors(pose.com_jac, first, ahead) for ahead in (1, 2))
+    jac_1, jac_2 = timeline.vectors(pose.com_jac, first, 1), timeline.vectors(pose.com_jac, first, 2)
     lever = -cross_matrix(given[:, :3]) / RADIUS @ jac_1
     blocks = {
         0: (fps**2 * pose.com_jac[first], -rate * between[first] @ before[first]),
@@ -80,7 +80,7 @@ def motor_torque(
     velocity, acceleration = rates(change[first], change[second], timeline.fps)
     inverse = InverseDynamics(robot)
     lack = np.zeros((len(first), robot.num_joints))
-    position, speed, rate = (np.zeros((*lack.shape, robot.model.nv)) for _ in range(3))
+    position, speed, rate = np.zeros((3, *lack.shape, robot.model.nv))
     for row, frame in enumerate(second):
         force = inverse.force(pose.qpos[frame], velocity[row], acceleration[row])
         touching = (pose.floor[frame, :, 2] < TOUCHING) & ~flight[frame]

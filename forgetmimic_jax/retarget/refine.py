@@ -73,9 +73,8 @@ def refine(
         iterations: Gauss-Newton steps a round.
     """
     weights = Weights()
-    gentle, strict = (
-        Problem.of(robot, goals, contact, timeline, given) for given in (weights.with_dynamics(GENTLE), weights)
-    )
+    gentle = Problem.of(robot, goals, contact, timeline, weights.with_dynamics(GENTLE))
+    strict = Problem.of(robot, goals, contact, timeline, weights)
 
     def solved(problem: Problem, start: np.ndarray) -> tuple[np.ndarray, float]:
         return gauss_newton(problem.terms, problem.moved, start, robot.model.nv, timeline.cyclic, iterations)
@@ -164,9 +163,9 @@ class Problem:
         every = np.arange(self.frames)
         pos, jac = pose.floor, pose.floor_jac
         height = pos[..., 2]
-        down, planted, lifted = (
-            self._by_point(parts) for parts in (self.contact.down, self.contact.planted, self.contact.lifted)
-        )
+        down = self._by_point(self.contact.down)
+        planted = self._by_point(self.contact.planted)
+        lifted = self._by_point(self.contact.lifted)
 
         touched = down.any(axis=0)
         hold = self.weights.stance_height * down[:, touched]

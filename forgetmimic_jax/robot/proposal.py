@@ -101,14 +101,14 @@ def _bodies(tree: Tree, limbs: Sequence[tuple[int, int]], missing: list[str]) ->
         missing.append(
             "arms: two pairs of limbs reach the ground alike (a quadruped?); mend: correct the proposed pairs"
         )
-    leg, arm = (_limb(tree, pair[0], *words) for pair, words in ((legs, (KNEE, FOOT)), (arms, (ELBOW, HAND))))
+    leg, arm = _limb(tree, legs[0], KNEE, FOOT), _limb(tree, arms[0], ELBOW, HAND)
     roles = {"hips": leg[0], "knees": leg[1], "feet": leg[2], "shoulders": arm[0], "elbows": arm[1], "hands": arm[2]}
     pairs = {role: [tree.names[body], tree.names[tree.other.get(body, body)]] for role, body in roles.items()}
     lonely = [pair[0] for pair in pairs.values() if pair[0] == pair[1]]
     if lonely:
         missing.append(f"the other side of {', '.join(lonely)}; mend: name it in pairs")
     anchor = int(tree.model.body_parentid[arms[0]])
-    left, right = ([pair[side] for pair in pairs.values()] for side in (0, 1))
+    left, right = [pair[0] for pair in pairs.values()], [pair[1] for pair in pairs.values()]
     order = [tree.names[1], *left[:3], *right[:3], tree.names[anchor], *left[3:], *right[3:]]
     ends = [*pairs["feet"], *pairs["hands"]]
     return {

@@ -39,7 +39,7 @@ def side_problems(model: mujoco.MjModel, pairs: Pairs[int]) -> Iterator[str]:
     """Pairs that give no left and right, and limbs whose joints cannot be counterparts; a line each."""
     starts: dict[int, tuple[str, str]] = {}
     for role, pair in vars(pairs).items():
-        left, right = (model.body(body).name for body in pair)
+        left, right = model.body(pair[0]).name, model.body(pair[1]).name
         if pair[0] in _chain(model, pair[1]) or pair[1] in _chain(model, pair[0]):
             yield f"{role}: '{left}' and '{right}' are one body, or one carries the other; accepted: left and right"
             continue

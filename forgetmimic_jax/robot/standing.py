@@ -56,7 +56,8 @@ def standing(tree: Tree, roles: Mapping[str, Any], keyframe: Mapping[str, float]
 
 def _pitches(tree: Tree, roles: Mapping[str, Any], side: int) -> list[str]:
     """The joints of a leg that bend it: at its hip, its knee and its ankle; fewer where it has not all of them."""
-    knee, foot = (tree.names.index(roles["pairs"][role][side]) for role in ("knees", "feet"))
+    knee = tree.names.index(roles["pairs"]["knees"][side])
+    foot = tree.names.index(roles["pairs"]["feet"][side])
     data = at_rest(tree.model)
     found: dict[str, str] = {}
     body = foot

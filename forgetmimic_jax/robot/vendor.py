@@ -228,7 +228,8 @@ def _set_option(spec: mujoco.MjSpec, notes: list[str]) -> None:
     own, ours = spec.option, mujoco.MjSpec().option
     own.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)  # of no effect on the project's integrator
     for name in (name for name in dir(ours) if not name.startswith("_") and name not in SETTINGS):
-        found, expected = (_option_in_words(name, getattr(option, name)) for option in (own, ours))
+        found = _option_in_words(name, getattr(own, name))
+        expected = _option_in_words(name, getattr(ours, name))
         setattr(own, name, getattr(ours, name))
         if found != expected:
             notes.append(f"<option> {name}: {found} is replaced by {expected}")

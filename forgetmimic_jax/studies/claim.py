@@ -101,7 +101,8 @@ def finding_between(
     The claim holds where it does with every number at its end nearest to the bound's wrong side, and does not hold
     where it fails with every number at the other end. An infinite end decides nothing.
     """
-    lows, highs = ({repeat: value[place] for repeat, value in values.items()} for place in (0, 1))
+    lows = {repeat: low for repeat, (low, _) in values.items()}
+    highs = {repeat: high for repeat, (_, high) in values.items()}
     cautious, generous = (highs, lows) if below else (lows, highs)
     for ends, word in ((cautious, HOLDS), (generous, FAILS)):
         if _finite(ends):

@@ -271,7 +271,7 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
     physics, bodies = _simulate(env, assets, dataclasses.replace(state, physics=physics), joint_target)
     diverged = ~_all_sane((physics, bodies), env.num_envs)
     # A diverged robot shows as standing where it was, so that no NaN can reach a sum; it is reset right after.
-    physics, bodies = (_where(diverged, old, new) for old, new in ((state.physics, physics), (state.bodies, bodies)))
+    physics, bodies = _where(diverged, state.physics, physics), _where(diverged, state.bodies, bodies)
 
     reference = reference_of(env, assets, dataclasses.replace(state, bodies=bodies), ahead=1)
     aligned = align_to_anchor(reference, robot.anchor, bodies.pos[:, robot.anchor], bodies.quat[:, robot.anchor])
@@ -294,7 +294,8 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
     if env.runs_on:
         is_target = assets.is_target[state.clip]
         causes = {name: broken & ~is_target for name, broken in causes.items()}
-        clip_before, clip_after = (lookup(assets.library, state.clip, state.frame + ahead).bodies for ahead in (0, 1))
+        clip_before = lookup(assets.library, state.clip, state.frame).bodies
+        clip_after = lookup(assets.library, state.clip, state.frame + 1).bodies
         causes["fall"] = is_target & falls(robot, state.bodies, bodies, clip_before, clip_after)
     terminated = diverged | jnp.stack(list(causes.values())).any(0)
     steps = state.step + 1

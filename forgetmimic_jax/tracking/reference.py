@@ -59,7 +59,7 @@ def anchor_between(
         frame: [env].
         fraction: of the way to the next frame, 0 to 1, the same for every environment.
     """
-    now, following = (lookup(library, clip, frame + ahead) for ahead in (0, 1))
+    now, following = lookup(library, clip, frame), lookup(library, clip, frame + 1)
 
     def between(here: Array, there: Array) -> Array:
         return here + fraction * (there - here)

@@ -69,8 +69,8 @@ def carried_over(policy: Policy, config: Config, old: Robot, new: Robot, fresh: 
     size, new_size = policy.actor_normalizer.mean.size, fresh.actor_normalizer.mean.size
     private = np.arange(policy.critic_normalizer.mean.size - size)  # of the critic alone
     critic_rows = (np.append(rows[0], size + private), np.append(rows[1], new_size + private))
-    normalizers = (policy.actor_normalizer, policy.critic_normalizer)
-    actor_normalizer, critic_normalizer = (_moved(of, layout, actions, old, new) for of in normalizers)
+    actor_normalizer = _moved(policy.actor_normalizer, layout, actions, old, new)
+    critic_normalizer = _moved(policy.critic_normalizer, layout, actions, old, new)
     actor, critic = policy.actor["params"], policy.critic["params"]
     log_std = np.full(new.num_joints, np.mean(actor["log_std"]), np.float32)
     log_std[places[1]] = (np.asarray(actor["log_std"]) + np.log(actions.ratio))[places[0]]
@@ -98,7 +98,7 @@ class Actions(NamedTuple):
     def of(self, layers: Mapping[str, Any]) -> Mapping[str, Any]:
         """A perceptron's layers with such an output."""
         last = f"Dense_{len(layers) - 1}"
-        kernel, bias = (np.asarray(layers[last][part]) for part in ("kernel", "bias"))
+        kernel, bias = np.asarray(layers[last]["kernel"]), np.asarray(layers[last]["bias"])
         return {**layers, last: {"kernel": kernel * self.ratio, "bias": bias * self.ratio + self.shift}}
 
 
@@ -107,7 +107,7 @@ def _actions(config: Config, old: Robot, new: Robot) -> Actions:
     actions = Actions(np.ones(old.num_joints), np.zeros(old.num_joints))
     if config.action.mode == "offset":
         ours, theirs = shared_joints(old, new)
-        scale, new_scale = (_in_policy_order(robot, "action_scale") for robot in (old, new))
+        scale, new_scale = _in_policy_order(old, "action_scale"), _in_policy_order(new, "action_scale")
         actions.ratio[ours] = scale[ours] / new_scale[theirs]
         actions.shift[ours] = _pose_change(old, new) / new_scale[theirs]
     return actions
@@ -120,9 +120,8 @@ def _in_policy_order(robot: Robot, field: str) -> np.ndarray:
 
 def _pose_change(old: Robot, new: Robot) -> np.ndarray:
     """The old robot's default pose less the new one's, rad, of the joints that both have."""
-    poses = (_in_policy_order(robot, "default_joint_pos") for robot in (old, new))
-    here, there = (pose[joints] for pose, joints in zip(poses, shared_joints(old, new), strict=True))
-    return here - there
+    ours, theirs = shared_joints(old, new)
+    return _in_policy_order(old, "default_joint_pos")[ours] - _in_policy_order(new, "default_joint_pos")[theirs]
 
 
 def shared_joints(old: Robot, new: Robot) -> Places:

@@ -246,7 +246,7 @@ def check_matches(
         shaping += ["ppo.num_envs", "sampling.bin_seconds"]
     theirs, ours = by_name(info.config), by_name(setup.config)
     for name in {**theirs, **ours}:
-        found, needed = (values.get(name, "the robot's own") for values in (theirs, ours))
+        found, needed = theirs.get(name, "the robot's own"), ours.get(name, "the robot's own")
         if found != needed and any(name == of or name.startswith(f"{of}.") for of in shaping):
             raise InputError(f"{info.path}: {name}: the checkpoint's is {found}, this run's {needed}")
 

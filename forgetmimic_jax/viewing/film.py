@@ -135,7 +135,8 @@ def _pane(
     pen = ImageDraw.Draw(image, "RGBA")
     width, height = PANE
     _chip(pen, (10, 10), name.replace("_", " "), INK)
-    ended, fell = (steps is not None and step >= steps for steps in (take.ended, take.fell))
+    ended = take.ended is not None and step >= take.ended
+    fell = take.fell is not None and step >= take.fell
     rewards = take.tracking_reward
     reward = 0.0 if ended else float(rewards[min(step, len(rewards) - 1)])
     text = f"tracking {reward:.2f}"

@@ -114,15 +114,12 @@ class Page:
 
     def _in_words(self, policy: int) -> tuple[str, str]:
         playback = self._playback
-        ended, fell = (
-            None if steps is None else steps * playback.control_step
-            for steps in (playback.ended[policy], playback.fell[policy])
-        )
+        ended, fell = playback.ended[policy], playback.fell[policy]
         return in_words(
             self._policies[policy],
             target=playback.clip in self._targets,
-            ended=ended,
-            fell=fell,
+            ended=None if ended is None else ended * playback.control_step,
+            fell=None if fell is None else fell * playback.control_step,
             now=playback.step * playback.control_step,
             impact=float(playback.impact[policy]),
         )
