@@ -6,13 +6,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
+import jax.numpy as jnp
+
 from forgetmimic_jax.basics.console import progress
 from forgetmimic_jax.basics.files import write_atomically
 from forgetmimic_jax.basics.provenance import made_here
 from forgetmimic_jax.evaluation import unbounded
 from forgetmimic_jax.evaluation.document import FILE, SCHEMA, EvaluationDocument, write_evaluation
 from forgetmimic_jax.evaluation.metrics import ZERO_ACTION
-from forgetmimic_jax.evaluation.rollout import Evaluator
+from forgetmimic_jax.evaluation.rollout import Evaluator, Switched
 from forgetmimic_jax.evaluation.summary import evaluate_policies
 from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.settings.config import config_hash
@@ -52,9 +54,10 @@ def evaluate(
     rollouts = {}
     everyone: dict[str, Policy | None] = {name: subject.policy for name, subject in subjects.items()}
     everyone[ZERO_ACTION] = None
+    some_policy = next(iter(subjects.values())).policy
     with progress("evaluate", len(everyone)) as show:
         for done, (name, policy) in enumerate(everyone.items(), start=1):
-            rollouts[name] = evaluator.rollout(policy)
+            rollouts[name] = evaluator.rollout(Switched(policy or some_policy, jnp.asarray(policy is not None)))
             show(done, sum(int(rollout.length.sum()) for rollout in rollouts.values()), {})
     policies = evaluate_policies(rollouts, setup.library.names, targets, seed=seed)
     if targets and not noise:

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
 from jax import Array
 
 from forgetmimic_jax.basics import rotation
@@ -37,6 +38,18 @@ class Acting(Protocol):
     def mean_action(self, observation: Array) -> Array:
         """The action [env, joint] at an actor observation [env, features]."""
         ...
+
+
+@struct.dataclass
+class Switched:
+    """A policy, or with `on` false the zero action. Both are one program, where compiling takes longer than acting."""
+
+    policy: Acting
+    on: Array  # bool[]
+
+    def mean_action(self, observation: Array) -> Array:
+        """The policy's action [env, joint] at an actor observation [env, features], or 0."""
+        return jnp.where(self.on, self.policy.mean_action(observation), 0.0)
 
 
 class Evaluator:

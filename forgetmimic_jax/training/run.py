@@ -127,7 +127,9 @@ def run(
         raise
     if stop or stopped:
         raise interrupted(config, directory, course.command)
-    return saved, local(mesh, now.state)
+    state = local(mesh, now.state)
+    # On the host: on a device of the mesh, what was compiled for other policies would be compiled again for this one.
+    return saved, dataclasses.replace(state, policy=jax.device_get(state.policy)) if mesh else state
 
 
 def interrupted(config: Config, directory: Path, command: str) -> Interrupted:

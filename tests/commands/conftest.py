@@ -5,13 +5,15 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import jax
+import numpy as np
 import pytest
 from miniature import TINY, Run, finished
 
 from forgetmimic_jax import train, unlearn
 from forgetmimic_jax.basics.errors import run_command
 from forgetmimic_jax.settings.config import config_hash
-from forgetmimic_jax.training import run
+from forgetmimic_jax.training import comparison, run
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -25,6 +27,26 @@ def compiled_once() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run, "make_iteration", shared)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def checked_once() -> Iterator[None]:
+    """Whether a base completes anything is found once for a policy and its clips, since that compiles an evaluation."""
+    check, found = comparison.completes_nothing, {}
+
+    def once(setup, policy):
+        key = (
+            comparison.Evaluator,
+            setup.library.names,
+            *(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(policy)),
+        )
+        if key not in found:
+            found[key] = check(setup, policy)
+        return found[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(comparison, "completes_nothing", once)
         yield
 
 

@@ -17,7 +17,7 @@ from forgetmimic_jax.evaluation.relearning import comparable_settings
 from forgetmimic_jax.robot.model import load_robot
 from forgetmimic_jax.settings.config import PretrainConfig, UnlearnConfig
 from forgetmimic_jax.tracking.setup import Setup, make_setup
-from forgetmimic_jax.training import checkpoint, pretraining, watch
+from forgetmimic_jax.training import checkpoint, distil, pretraining, watch
 from forgetmimic_jax.training import run as run_module
 from forgetmimic_jax.training.checkpoint import newest_checkpoint
 from forgetmimic_jax.training.pretraining import Pretraining
@@ -62,7 +62,10 @@ def setup(tiny_config, library_folder) -> Setup:
 
 @pytest.fixture(scope="module")
 def pretrain(setup) -> Callable[..., Path]:
-    """`pretrain(folder, resume=..., kill=...)`: evaluations are the curve's; `kill` names where the run is killed."""
+    """`pretrain(folder, resume=..., kill=...)`: evaluations are the curve's; `kill` names where the run is killed.
+
+    All runs share the compiled iteration and rounds. Those that are killed and resumed draw no picture.
+    """
     made: dict[str, object] = {}
     results: dict[str, list] = {}
 
@@ -97,8 +100,11 @@ def pretrain(setup) -> Callable[..., Path]:
                 "clips": clips,
             }
 
-        iterate = once("iteration", run_module.make_iteration)
+        iterate, make_round = once("iteration", run_module.make_iteration), distil.make_round
         with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(distil, "make_round", lambda env, config: once(str(config), make_round)(env, config))
+            if kill or resume:
+                patch.setattr(watch, "clips_over_time", lambda *given: None)
             patch.setattr(watch.Watch, "measure", counted("evaluation", measure))
             patch.setattr(run_module, "make_iteration", lambda *given: counted("iteration", iterate(*given)))
             for name in ("first_failures", "search", "begin", "distil"):
