@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from forgetmimic_jax.evaluation.rollout import CHUNK, Evaluator, episode_starts, evaluation_setup, step_errors
+from forgetmimic_jax.evaluation.rollout import (
+    CHUNK,
+    Evaluator,
+    Switched,
+    episode_starts,
+    evaluation_setup,
+    step_errors,
+)
 from forgetmimic_jax.physics import BodyState
 from forgetmimic_jax.policy.policy import Policy, init_policy
 from forgetmimic_jax.ppo.rule import Rule
@@ -102,6 +109,14 @@ def test_a_policy_that_outputs_zero_is_the_zero_action(evaluator, zero_action, p
     rollout = evaluator.rollout(silent)  # its standard deviation is 1: sampled actions would be far from zero
     np.testing.assert_array_equal(rollout.length, zero_action.length)
     np.testing.assert_allclose(rollout.tracking_reward, zero_action.tracking_reward, atol=1e-6)
+
+
+def test_a_policy_that_is_switched_off_is_the_zero_action(evaluator, zero_action, echo):
+    policy = echo(0.2, 0.0)
+    off, on = (evaluator.rollout(Switched(policy, jnp.asarray(value))) for value in (False, True))
+    np.testing.assert_array_equal(off.tracking_reward, zero_action.tracking_reward)
+    np.testing.assert_array_equal(on.tracking_reward, evaluator.rollout(policy).tracking_reward)
+    assert not np.array_equal(on.tracking_reward, off.tracking_reward)
 
 
 def test_under_a_rule_a_target_has_another_reference_and_runs_on(tiny_setup, library):
