@@ -105,7 +105,8 @@ def base_policy(setup: Setup) -> Policy:
 def start_state(setup: Setup, env: Environment, assets: Assets) -> TrainState:
     """A fresh run's state; with a base, a warm start from its policy, unless the method trains a fresh one.
 
-    Where unlearning samples or assists by failure levels, it starts with the base's.
+    Where unlearning samples or assists by failure levels, it starts with the base's, unless something else than the
+    clip is the reference: that the base failed at a clip says nothing about it.
     """
     config, unlearning = setup.config, bool(setup.config.unlearn.targets)
     key = jax.random.PRNGKey(config.seed)
@@ -113,7 +114,7 @@ def start_state(setup: Setup, env: Environment, assets: Assets) -> TrainState:
         return jax.jit(lambda assets, key: init_state(env, assets, key))(assets, key)
     policy, failure_level = setup.base or base_policy(setup), None
     by_failure = config.sampling.rule == "adaptive" or config.wrench.max_gain > 0
-    if config.sampling.rule == "frozen" or (unlearning and by_failure):
+    if config.sampling.rule == "frozen" or (unlearning and by_failure and not env.replace_reference):
         failure_level = checkpoint.load_failure_level(base_checkpoint(config), assets.bins)
     start = jax.jit(lambda assets, key, policy, level: init_state(env, assets, key, policy, level))
     return start(assets, key, policy, failure_level)
