@@ -483,7 +483,8 @@ def test_a_base_that_cannot_stand_learns_that_first_and_then_teaches(options, tm
     assert re.search(r"^after training it stays upright in \d+%$", printed, re.M)
     learned = checkpoint.read_info(tmp_path / "run-stand" / "checkpoints" / "00000002")
     assert (learned.config.sampling.target_share, learned.config.unlearn.method) == (1.0, "stand")
-    assert (learned.config.sampling.bin_seconds, learned.config.sampling.rule) == (0.3, "adaptive")  # not the base's 0.4
+    starts = learned.config.sampling
+    assert (starts.rule, starts.bin_seconds) == ("adaptive", 0.3)  # its bins are not the base's
     config = load_config(tmp_path / "run" / "config.yaml")
     assert (config.unlearn.instead, config.sampling.target_share, config.unlearn.stop_every) == ("stand", 0.5, 0)
     assert config.sampling.first_frame == PACE.first_frame > 0.0
