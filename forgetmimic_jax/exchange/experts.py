@@ -18,6 +18,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
+from forgetmimic_jax.basics.console import Show
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.exchange.foreign import ForeignPolicy
 from forgetmimic_jax.exchange.trial import Tracked
@@ -179,7 +180,7 @@ def merge(
     student: Setup,
     experts: Sequence[tuple[Expert, Sequence[int]]],
     is_enough: Callable[[Policy], bool],
-    progress: Callable[[int, int, Mapping[str, float]], None] = lambda done, steps, metrics: None,
+    progress: Show = lambda done, steps, metrics: None,
 ) -> tuple[Policy, int]:
     """Regress a fresh policy on experts, each with the clips of the student's library that it teaches.
 
