@@ -26,11 +26,15 @@ from forgetmimic_jax.settings.options import (
 if TYPE_CHECKING:
     from forgetmimic_jax.tracking.setup import Setup
 
-# What differs from the preset: how long, and how often the curriculum looks, at enough episodes to judge by. A base has
-# to survive pushes and wrong sensors, and its robot cannot reach through itself.
+# What differs from the preset: how long, how often the curriculum looks, at how many episodes, and that it looks at a
+# policy that does not scatter between iterations. A base has to survive pushes and wrong sensors, and its robot cannot
+# reach through itself.
 DIFFERENCES: dict[str, tuple[str, ...]] = {
-    "cpu": ("iterations=7200", "evaluate_every=100", "noise.enabled=true", "physics.self_collision=true"),
-    "paper": ("iterations=30000", "evaluate_every=500"),
+    "cpu": (
+        *("iterations=7200", "evaluate_every=100", "pretrain.average=75"),
+        *("noise.enabled=true", "physics.self_collision=true"),
+    ),
+    "paper": ("iterations=30000", "evaluate_every=500", "pretrain.average=75"),
 }
 EPISODES = 20  # a clip in an evaluation
 

@@ -5,6 +5,9 @@ Saved and restored, a run continues as if it had not stopped.
 
 from __future__ import annotations
 
+import dataclasses
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import optax
@@ -37,6 +40,12 @@ class TrainState:
     key: Array
     iteration: Array  # i32[]
     diverged: Array  # i32[] environments reset because of NaN or Inf, so far
+    average: Any = None  # the policy's parameters averaged over iterations (Polyak and Juditsky 1992); None: not wanted
+
+    @property
+    def averaged(self) -> Policy:
+        """The policy with the averaged parameters, where there are any."""
+        return self.policy if self.average is None else self.policy.with_parameters(self.average)
 
 
 def make_optimizer(config: PPOConfig) -> optax.GradientTransformation:
@@ -67,7 +76,7 @@ def init_state(
     if policy is None:
         actor, critic = observe(env, assets, episodes, None)
         policy = init_policy(config.ppo, env.robot.num_joints, actor.shape[1], critic.shape[1], policy_key)
-    return TrainState(
+    state = TrainState(
         policy=policy,
         optimizer=make_optimizer(config.ppo).init(policy.parameters),
         learning_rate=jnp.asarray(config.ppo.learning_rate, jnp.float32),
@@ -77,3 +86,4 @@ def init_state(
         iteration=jnp.zeros((), jnp.int32),
         diverged=jnp.zeros((), jnp.int32),
     )
+    return dataclasses.replace(state, average=policy.parameters) if config.pretrain.average else state

@@ -46,6 +46,7 @@ def make_iteration(
         advantage, value_target = advantages(env.config.ppo, assets.focus.gae_lambda, outcome)
         batch = make_batch(env.config, assets, transition, outcome.value, advantage, value_target)
         state, losses = improve(env.config, assets.focus, state, batch, rule)
+        state = learn_average(env.config.pretrain.average, state)
         state = learn_normalizers(state, transition)
         state = learn_sampler(env.config, state, transition.clip, outcome)
         metrics = losses | rollout_metrics(env.config, assets, state, transition.clip, outcome)
@@ -166,6 +167,14 @@ def shuffled(key: Array, size: int, minibatches: int) -> Array:
     """Indices [minibatch, n] of one epoch over `size` steps in random order; a remainder is left out."""
     indices = jax.random.permutation(key, size)[: size - size % minibatches]
     return indices.reshape(minibatches, -1)
+
+
+def learn_average(iterations: int, state: TrainState) -> TrainState:
+    """The average, where the state has one, moves towards the new parameters by 1 / `iterations` of the distance."""
+    if state.average is None:
+        return state
+    average = jax.tree.map(lambda old, new: old + (new - old) / iterations, state.average, state.policy.parameters)
+    return dataclasses.replace(state, average=average)
 
 
 def learn_normalizers(state: TrainState, transition: Transition) -> TrainState:

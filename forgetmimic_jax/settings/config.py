@@ -199,11 +199,13 @@ class PPOConfig:
 class PretrainConfig:
     """The phases of pretraining, which are in training/curriculum.py; ordinary training has none.
 
-    Tracking is survival-weighted. Progress is counted from one evaluation to the next (`evaluate_every` iterations).
+    The score of a clip is the mean of its success and its survival-weighted tracking. Progress is counted from one
+    evaluation to the next (`evaluate_every` iterations).
     """
 
-    mastered: Share = 0.9  # success from which a clip is mastered
-    gain: Positive = 0.01  # rise of a tracking above its record that counts as progress
+    average: Period = 0  # iterations over which the parameters are averaged that are evaluated and kept; 0: the newest
+    mastered: Share = 0.95  # success from which a clip is mastered
+    gain: Positive = 0.01  # rise of a score above its record that counts as progress
     patience: Count = 3  # evaluations without progress after which a clip is stuck, or a phase ends
     lagging_share: Share = 0.75  # of the steps, for the clips that are new or learning, in the phase `lagging`
     best_kl: Amount = 0.1  # weight of KL(π ‖ π_best) on the clips that the best policy has mastered, there
@@ -211,7 +213,6 @@ class PretrainConfig:
     gae_lambda: Share = 0.97  # in the place of ppo.gae_lambda, likewise
     broad_until: Share = 0.5  # of the iterations: the end of a phase that still makes progress
     lagging_until: Share = 0.7
-    stuck_until: Share = 0.9  # what remains is for the phase `settle`
     specialist_evaluations: Count = 8  # the longest training of a specialist
     search_rounds: Period = 75  # of the search for a first success; 0: no search
     distil_rounds: Count = 80

@@ -360,7 +360,8 @@ def _tensors(info: CheckpointInfo) -> dict[str, np.ndarray]:
 
 
 def _run_part(state: TrainState) -> dict[str, Any]:
-    return {name: getattr(state, name) for name in vars(state) if name not in ("policy", FAILURE_LEVEL)}
+    parts = {name: value for name, value in vars(state).items() if name not in ("policy", FAILURE_LEVEL)}
+    return {name: value for name, value in parts.items() if value is not None}
 
 
 def _system_error(pattern: str, error: Exception, path: Path) -> Exception:

@@ -1,16 +1,17 @@
 """The phases of pretraining: a pure function from what an evaluation found to the settings of the next iterations.
 
-broad    All clips, more steps for those that fail. Ends when the mean tracking makes no progress.
+broad    All clips, more steps for those that fail. Ends when the mean score makes no progress.
 lagging  Most of the steps for the clips that are new or learning; on the clips that the best policy has mastered, a KL
-         to it. Ends when every clip is mastered or stuck.
-stuck    A specialist for every clip that is not mastered, one after the other: training on that clip alone from the
-         best policy. Ends when each has mastered its clip or makes no progress.
-distil   The specialists and the best policy become one. No iterations. Then `lagging` again, or where it is too late
-         for that, another specialist for every clip that is not mastered.
-settle   All clips, with a step size that falls and a KL to the best policy.
+         to it. Ends when the mean score makes no progress, or every clip is mastered or stuck.
+distil   The best policy and the experts become one. No iterations.
+stuck    A specialist for every clip that is not mastered, one after the other: training on that clip alone. Ends when
+         each has mastered its clip or makes no progress. Then `distil` again, and so on.
+done     The best policy has mastered every clip, no specialist helped, or no iterations are left.
 
-Every phase starts from the best policy, which is the one with the highest mean tracking (survival-weighted), and has a
-latest end in iterations. Everything here is plain values, so that a curriculum can be written as JSON.
+The score of a clip is the mean of its success and its tracking (survival-weighted). Of all policies that were
+evaluated, the best one has the highest mean score, and the expert of a clip has the highest score on it, if that is
+clearly above the best policy's. A specialist starts from its clip's expert, if there is one; all else starts from the
+best policy. Everything here is plain values, so that a curriculum can be written as JSON.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from typing import Literal
 
 from forgetmimic_jax.settings.config import Config, PretrainConfig
 
-Phase = Literal["broad", "lagging", "stuck", "distil", "settle", "done"]
+Phase = Literal["broad", "lagging", "distil", "stuck", "done"]
 ClipState = Literal["new", "learning", "mastered", "stuck"]
 
 
@@ -33,6 +34,12 @@ class Measured:
     success: float = 0.0
     tracking: float = 0.0  # survival-weighted
     steps: float = 1.0  # control steps of a mean episode
+    completed: bool = False  # an episode from the first frame reached the clip's end
+
+    @property
+    def score(self) -> float:
+        """Mean of success and tracking: one may rise without the other."""
+        return 0.5 * (self.success + self.tracking)
 
 
 @dataclass(frozen=True)
@@ -40,12 +47,12 @@ class ClipProgress:
     """How far a clip has come in this phase."""
 
     last: Measured = Measured()
-    record: float = 0.0  # the highest tracking
+    record: float = 0.0  # the highest score
     stalled: int = 0  # evaluations since the record rose by `gain`
-    completed: bool = False  # an evaluation's episode has completed it, in this phase or before
+    completed: bool = False  # an episode from the first frame has completed it, in this phase or before
 
     def state(self, config: PretrainConfig) -> ClipState:
-        """new: no episode has completed it; mastered; stuck: not mastered and no progress; learning: else."""
+        """mastered; stuck: no progress; new: no episode from the first frame has completed it; learning: else."""
         if self.last.success >= config.mastered:
             return "mastered"
         if self.stalled >= config.patience:
@@ -54,12 +61,12 @@ class ClipProgress:
 
     def after(self, config: PretrainConfig, found: Measured) -> ClipProgress:
         """With one more evaluation."""
-        progress = found.tracking >= self.record + config.gain
+        progress = found.score >= self.record + config.gain
         return ClipProgress(
             last=found,
-            record=found.tracking if progress else self.record,
+            record=found.score if progress else self.record,
             stalled=0 if progress else self.stalled + 1,
-            completed=self.completed or found.success > 0.0,
+            completed=self.completed or found.completed,
         )
 
 
@@ -71,9 +78,9 @@ class Kept:
     clips: dict[str, Measured]
 
     @property
-    def tracking(self) -> float:
-        """Mean tracking over the clips."""
-        return sum(clip.tracking for clip in self.clips.values()) / len(self.clips)
+    def score(self) -> float:
+        """Mean score over the clips."""
+        return sum(clip.score for clip in self.clips.values()) / len(self.clips)
 
 
 @dataclass(frozen=True)
@@ -86,16 +93,22 @@ class Curriculum:
     evaluations: int = 0  # in this stage
     longest: int = 0  # evaluations that this specialist may have
     number: int = 0  # evaluations of the run
-    record: float = 0.0  # highest mean tracking of this stage
+    record: float = 0.0  # highest mean score of this stage
     stalled: int = 0  # evaluations since it rose by `gain`
     specialists: tuple[str, ...] = ()  # clips that still need one; the first one's is being trained
-    experts: dict[str, Kept] = field(default_factory=dict)  # by clip, specialists that track it better than the best
+    experts: dict[str, Kept] = field(default_factory=dict)  # by clip
     best: Kept | None = None
 
     @property
     def specialist(self) -> str | None:
         """The clip that a specialist is trained on, if any."""
         return self.specialists[0] if self.phase == "stuck" else None
+
+    @property
+    def start(self) -> Kept:
+        """The policy that this stage starts from: the best one, or for a specialist its clip's expert."""
+        assert self.best is not None
+        return self.experts.get(self.specialist or "", self.best)
 
     def states(self, config: PretrainConfig) -> dict[str, ClipState]:
         """The state of every clip."""
@@ -106,7 +119,7 @@ class Curriculum:
         assert self.best is not None
         clips = self.best.clips
         missing = [name for name, clip in clips.items() if clip.success < config.mastered]
-        return sorted(missing, key=lambda name: (-clips[name].success, -clips[name].tracking))
+        return sorted(missing, key=lambda name: -clips[name].score)
 
 
 @dataclass(frozen=True)
@@ -130,8 +143,8 @@ def advance(config: Config, curriculum: Curriculum, found: Mapping[str, Measured
     """
     rules, done = config.pretrain, iteration / config.iterations
     kept = Kept(curriculum.number + 1, dict(found))
-    best = kept if curriculum.best is None or kept.tracking > curriculum.best.tracking else curriculum.best
-    progress = kept.tracking >= curriculum.record + rules.gain
+    best = kept if curriculum.best is None or kept.score > curriculum.best.score else curriculum.best
+    progress = kept.score >= curriculum.record + rules.gain
     seen = dataclasses.replace(
         curriculum,
         clips={
@@ -140,89 +153,72 @@ def advance(config: Config, curriculum: Curriculum, found: Mapping[str, Measured
         },
         evaluations=curriculum.evaluations + 1,
         number=kept.number,
-        record=kept.tracking if progress else curriculum.record,
+        record=kept.score if progress else curriculum.record,
         stalled=0 if progress else curriculum.stalled + 1,
         best=best,
+        experts=_experts(rules, best, curriculum.experts, kept),
     )
+    if not seen.unmastered(rules):
+        return dataclasses.replace(seen, phase="done")
+    stalled = seen.stalled >= rules.patience
     match seen.phase:
         case "broad":
-            ended = seen.stalled >= rules.patience or done >= rules.broad_until
-            return _after_broad(config, seen, done) if ended else seen
+            if not stalled and done < rules.broad_until:
+                return seen
+            return _begin(seen, "lagging") if done < rules.lagging_until else _after_lagging(config, seen, done)
         case "lagging":
             moving = any(state in ("new", "learning") for state in seen.states(rules).values())
-            return seen if moving and done < rules.lagging_until else _after_lagging(config, seen, done)
+            return seen if moving and not stalled and done < rules.lagging_until else _after_lagging(config, seen, done)
         case "stuck":
-            return _after_specialist(config, seen, kept, done)
+            moving = seen.clips[seen.specialists[0]].state(rules) in ("new", "learning")
+            if moving and seen.evaluations < seen.longest:
+                return seen
+            unmastered = seen.unmastered(rules)
+            return _specialists(config, seen, [name for name in seen.specialists[1:] if name in unmastered], done)
         case "distil":
-            return _after_broad(config, dataclasses.replace(seen, experts={}), done)
-        case "settle":
-            ended = seen.evaluations >= settle_evaluations(config) or done >= 1.0
-            return dataclasses.replace(seen, phase="done") if ended else seen
+            return _specialists(config, seen, seen.unmastered(rules), done)
     return seen
 
 
-def _after_broad(config: Config, seen: Curriculum, done: float) -> Curriculum:
-    """The clips that lag; where it is too late for that, specialists; where none lags, the end."""
-    if seen.unmastered(config.pretrain) and done < config.pretrain.lagging_until:
-        return _begin(seen, "lagging")
-    return _after_lagging(config, seen, done)
+def _experts(rules: PretrainConfig, best: Kept, experts: Mapping[str, Kept], new: Kept) -> dict[str, Kept]:
+    """By clip, the policy with the highest score on it, where that is above the best policy's by `gain`."""
+    first = {clip: max(experts.get(clip, new), new, key=lambda kept: kept.clips[clip].score) for clip in best.clips}
+    return {clip: kept for clip, kept in first.items() if kept.clips[clip].score >= best.clips[clip].score + rules.gain}
 
 
 def _after_lagging(config: Config, seen: Curriculum, done: float) -> Curriculum:
-    """A specialist for every clip that is not mastered."""
-    return _next_specialist(config, seen, tuple(seen.unmastered(config.pretrain)), done)
+    """Distillation of what single policies did best on the way, then specialists."""
+    return (
+        _begin(seen, "distil") if seen.experts else _specialists(config, seen, seen.unmastered(config.pretrain), done)
+    )
 
 
-def _after_specialist(config: Config, seen: Curriculum, kept: Kept, done: float) -> Curriculum:
-    """An expert is the specialist that tracks its clip best, and clearly better than the best policy."""
-    rules, clip = config.pretrain, seen.specialists[0]
-    assert seen.best is not None
-    best = seen.best.clips
-    if clip not in seen.experts or kept.clips[clip].tracking > seen.experts[clip].clips[clip].tracking:
-        seen = dataclasses.replace(seen, experts={**seen.experts, clip: kept})
-    experts = {
-        name: expert
-        for name, expert in seen.experts.items()
-        if expert.clips[name].tracking >= best[name].tracking + rules.gain
-    }
-    seen = dataclasses.replace(seen, experts=experts)
-    moving = seen.clips[clip].state(rules) in ("new", "learning") and seen.evaluations < seen.longest
-    return seen if moving else _next_specialist(config, seen, seen.specialists[1:], done)
-
-
-def _next_specialist(config: Config, seen: Curriculum, clips: tuple[str, ...], done: float) -> Curriculum:
-    """The first of the clips, with its part of the time that is left; without clips or time, distillation."""
-    evaluations = int((config.pretrain.stuck_until - done) * config.iterations / config.evaluate_every)
-    if not clips or evaluations < 1:
-        return _begin(seen, "distil" if seen.experts else "settle")
-    longest = min(config.pretrain.specialist_evaluations, max(1, evaluations // len(clips)))
-    return _begin(seen, "stuck", specialists=clips, longest=longest)
+def _specialists(config: Config, seen: Curriculum, clips: list[str], done: float) -> Curriculum:
+    """A specialist for the first of the clips, with its part of the time; without clips or time, distil or end."""
+    left = int((1.0 - done) * config.iterations / config.evaluate_every)
+    if clips and left >= 1:
+        longest = min(config.pretrain.specialist_evaluations, max(1, left // len(clips)))
+        return _begin(seen, "stuck", specialists=tuple(clips), longest=longest)
+    distil = seen.experts and seen.phase != "distil"
+    return _begin(seen, "distil") if distil else dataclasses.replace(seen, phase="done")
 
 
 def _begin(seen: Curriculum, phase: Phase, specialists: tuple[str, ...] = (), longest: int = 0) -> Curriculum:
-    """The best policy starts a phase, or a specialist; progress is counted from what it can do.
+    """A phase, or a specialist, begins; progress is counted from what its first policy can do.
 
     A clip that waits for its specialist, or had it, stays as it was.
     """
-    assert seen.best is not None
-    best = seen.best.clips
+    new = dataclasses.replace(
+        seen, phase=phase, stage=seen.stage + 1, evaluations=0, longest=longest, stalled=0, specialists=specialists
+    )
+    first = new.start.clips
     clips = {
-        name: ClipProgress(best[name], best[name].tracking, 0, clip.completed or best[name].success > 0.0)
-        if name in specialists[:1] or phase not in ("stuck", "distil")
+        name: ClipProgress(first[name], first[name].score, 0, clip.completed or first[name].completed)
+        if phase == "lagging" or name == new.specialist
         else clip
         for name, clip in seen.clips.items()
     }
-    return dataclasses.replace(
-        seen,
-        clips=clips,
-        phase=phase,
-        stage=seen.stage + 1,
-        evaluations=0,
-        longest=longest,
-        record=seen.best.tracking,
-        stalled=0,
-        specialists=specialists,
-    )
+    return dataclasses.replace(new, clips=clips, record=new.start.score)
 
 
 def settings_of(config: Config, curriculum: Curriculum) -> Settings:
@@ -233,10 +229,6 @@ def settings_of(config: Config, curriculum: Curriculum) -> Settings:
     best_kl = {name: 0.0 for name in curriculum.clips}
     if curriculum.phase == "lagging" and best is not None:
         best_kl = {name: rules.best_kl * (clip.success >= rules.mastered) for name, clip in best.clips.items()}
-    if curriculum.phase == "settle":  # the KL of an iteration goes with the square of the step size, which falls evenly
-        length = settle_evaluations(config)
-        best_kl = dict.fromkeys(best_kl, rules.best_kl)
-        target_kl *= (max(1, length - curriculum.evaluations) / length) ** 2
     shares = step_shares(config, curriculum)
     starts = {name: share / max(1.0, curriculum.clips[name].last.steps) for name, share in shares.items()}
     total = sum(starts.values())
@@ -263,8 +255,3 @@ def step_shares(config: Config, curriculum: Curriculum) -> dict[str, float]:
         return {name: rules.lagging_share * wanted[name] / total if name in wanted else others for name in clips}
     even, total = config.sampling.uniform_ratio / len(clips), max(sum(failure.values()), 1e-9)
     return {name: even + (1.0 - config.sampling.uniform_ratio) * failure[name] / total for name in clips}
-
-
-def settle_evaluations(config: Config) -> int:
-    """Evaluations of the last phase."""
-    return max(1, round((1.0 - config.pretrain.stuck_until) * config.iterations / config.evaluate_every))

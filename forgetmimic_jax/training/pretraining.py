@@ -6,6 +6,8 @@ besides what every run has:
 
 policies/NUMBER   the policies that the curriculum may still need, by the number of their evaluation
 
+What is evaluated and kept has the averaged parameters, if the run averages them: single iterations scatter.
+
 Clips that the training leaves out (the targets of a retrained control) are evaluated too, but the curriculum does not
 know them and no episode starts from them.
 """
@@ -43,12 +45,11 @@ from forgetmimic_jax.training.curriculum import (
 from forgetmimic_jax.training.devices import agreed
 from forgetmimic_jax.training.distil import DistilConfig, begin, distil
 from forgetmimic_jax.training.folder import BEST
-from forgetmimic_jax.training.search import SearchConfig, first_failures, search
+from forgetmimic_jax.training.search import SearchConfig, first_failure, search
 from forgetmimic_jax.training.teaching import Lesson, PolicyTeacher, make_teaching
 from forgetmimic_jax.training.watch import Watch
 
 POLICIES = "policies"
-MEASURED = ("success_rate", "survival_weighted_tracking", "episode_length")  # in the order of `Measured`
 
 
 class Pretraining:
@@ -90,6 +91,8 @@ class Pretraining:
 
     def begin(self, position: Position) -> Position:
         self._watch = Watch(self._setup, self._directory, position.iteration)
+        if self._config.base and not self._curriculum.number:
+            self._measure(position)  # the base may be better than what training makes of it
         return dataclasses.replace(position, assets=self._assets(position.state.policy))
 
     def after(self, position: Position) -> Position:
@@ -108,13 +111,9 @@ class Pretraining:
 
     def _measure(self, position: Position) -> None:
         """Evaluate the position's policy, and advance the curriculum by what is found."""
-        policy, now = position.state.policy, self._curriculum
+        policy, now = position.state.averaged, self._curriculum
         row = self._watch.measure(policy, position.iteration, position.environment_steps)
-        found = {
-            name: Measured(*(agreed(of[field]) for field in MEASURED))
-            for name, of in row["clips"].items()
-            if name in now.clips
-        }
+        found = {name: _measured(of) for name, of in row["clips"].items() if name in now.clips}
         self._curriculum = advance(self._config, now, found, position.iteration)
         specialist = {"specialist": now.specialist} if now.specialist else {}
         states = self._curriculum.states(self._config.pretrain)
@@ -129,11 +128,7 @@ class Pretraining:
     def _next_stage(self, position: Position) -> Position:
         """The state that a new stage starts with: fresh episodes, Adam reset."""
         now, config = self._curriculum, self._config
-        assert now.best is not None
-        if now.phase == "done":
-            self._say("done")
-            return position
-        policy, steps, level = self._load(now.best), position.environment_steps, position.state.failure_level
+        policy, steps, level = self._load(now.start), position.environment_steps, position.state.failure_level
         key = jax.random.fold_in(jax.random.PRNGKey(config.seed), now.stage)
         self._say(_headline(now, now.unmastered(config.pretrain)))
         if now.phase == "stuck" and not now.clips[now.specialists[0]].completed:
@@ -150,7 +145,7 @@ class Pretraining:
         position = dataclasses.replace(position, state=state, environment_steps=steps)
         if now.phase == "distil":
             self._measure(position)
-            return self._next_stage(position)
+            return position if self.finished else self._next_stage(position)
         return position
 
     def _assets(self, policy: Policy) -> Assets:
@@ -181,10 +176,10 @@ class Pretraining:
     def _first_success(self, policy: Policy, clip: str, key: jax.Array) -> tuple[Policy, int]:
         """The policy after regression on what a search found for a clip that it never completes, and the steps used."""
         rounds, index, robots = self._config.pretrain.search_rounds, self._names.index(clip), self._env.num_envs
-        if not rounds or robots < len(self._names):
+        if not rounds:
             return policy, 0
         assets = self._assets(policy)
-        failure = int(first_failures(self._env, assets, policy)[index])
+        failure = first_failure(self._env, assets, policy, index)
         if failure < 0:
             return policy, 0
         size = SearchConfig(rounds=max(1, round(0.6 * rounds)), noisy_rounds=max(1, round(0.4 * rounds)))
@@ -238,6 +233,16 @@ class Pretraining:
         self._console.print(text, highlight=False, markup=False, soft_wrap=True)
 
 
+def _measured(clip: Mapping[str, float]) -> Measured:
+    """What a row of evaluations.jsonl says of a clip; the same on all processes of a training."""
+    return Measured(
+        success=agreed(clip["success_rate"]),
+        tracking=agreed(clip["survival_weighted_tracking"]),
+        steps=agreed(clip["episode_length"]),
+        completed=agreed(clip["completed"]) > 0.0,
+    )
+
+
 def _numbers(curriculum: Curriculum) -> set[int]:
     """The policies that a curriculum names."""
     kept = [*curriculum.experts.values(), *([curriculum.best] if curriculum.best else [])]
@@ -248,5 +253,5 @@ def _headline(now: Curriculum, unmastered: list[str]) -> str:
     """What the terminal says of a stage that begins."""
     if now.phase == "stuck":
         return f"specialist for {now.specialists[0]} (then {', '.join(now.specialists[1:]) or 'distillation'})"
-    of = {"lagging": ", ".join(unmastered), "distil": ", ".join(now.experts), "settle": "a falling step size"}
+    of = {"lagging": ", ".join(unmastered), "distil": ", ".join(now.experts)}
     return f"{now.phase}: {of.get(now.phase, '')}"

@@ -59,21 +59,17 @@ class Found:
     lessons: Lesson  # [n] states and actions of those rollouts
 
 
-def first_failures(env: Environment, assets: Assets, policy: Policy) -> np.ndarray:
-    """Frame i[clip] at which the policy fails first, from frame 0 without reset noise; −1 where it completes the clip.
+def first_failure(env: Environment, assets: Assets, policy: Policy, clip: int) -> int:
+    """Frame of a clip at which the policy fails first, from frame 0 without reset noise; −1 where it completes it.
 
-    Robot i tracks clip i modulo the number of clips; an episode lasts at most `max_episode_steps`.
+    An episode lasts at most `max_episode_steps`.
     """
     env = dataclasses.replace(env, noisy=False)
-    clips = len(assets.is_target)
-    clip = np.arange(env.num_envs) % clips
-    if env.num_envs < clips:
-        raise ValueError(f"{env.num_envs} robots for {clips} clips; one a clip is needed")
-    steps = min(env.config.max_episode_steps, int(assets.library.length.max()) - 1)
+    steps = min(env.config.max_episode_steps, int(assets.library.length[clip]) - 1)
     state = _start(env, assets, clip, 0, 0.0, jax.random.PRNGKey(0))
     nothing = jnp.zeros((steps, 1, env.robot.num_joints))
-    survived = np.asarray(jax.jit(partial(_roll, env))(assets, policy, state, nothing)[0]).astype(int)
-    return np.where(survived < np.asarray(state.horizon), survived, -1)[:clips]
+    survived = int(jax.jit(partial(_roll, env))(assets, policy, state, nothing)[0][0])
+    return survived if survived < steps else -1
 
 
 def search(env: Environment, assets: Assets, policy: Policy, clip: int, failure: int, config: SearchConfig) -> Found:
@@ -84,7 +80,7 @@ def search(env: Environment, assets: Assets, policy: Policy, clip: int, failure:
         assets: constant arrays.
         policy: what the actions are added to.
         clip: index of the clip.
-        failure: frame at which the policy fails; see `first_failures`.
+        failure: frame at which the policy fails; see `first_failure`.
         config: size of the search.
 
     Raises:
@@ -139,7 +135,7 @@ def straight_lines(knots: int, steps: int) -> np.ndarray:
     return np.stack([np.interp(places, np.arange(knots), one) for one in np.eye(knots)], axis=-1)
 
 
-def _start(env: Environment, assets: Assets, clip: int | np.ndarray, frame: int, noise: float, key: Array) -> EnvState:
+def _start(env: Environment, assets: Assets, clip: int, frame: int, noise: float, key: Array) -> EnvState:
     """Every robot at a frame of a clip, with `noise` times the config's reset noise."""
     widths = {name: value for name, value in dataclasses.asdict(env.config.noise).items() if name.startswith("reset_")}
     scaled = dataclasses.replace(env.config.noise, **jax.tree.map(lambda width: noise * width, widths))

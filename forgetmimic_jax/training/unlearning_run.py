@@ -17,6 +17,7 @@ from forgetmimic_jax.settings.config import (
     EngineName,
     PPOConfig,
     Preset,
+    PretrainConfig,
     SamplingConfig,
     UnlearnConfig,
     WrenchConfig,
@@ -110,7 +111,7 @@ def config_of_new_run(options: Options) -> Config:
 
     info = checkpoint.read_info(options.base or base_folder(options.robot))
     config = _on_preset(info.config, options.preset) if options.preset else info.config
-    config = dataclasses.replace(config, base=None, evaluate_every=0, devices=1)
+    config = dataclasses.replace(config, base=None, evaluate_every=0, devices=1, pretrain=PretrainConfig())
     base = info.path if options.base else None  # a run's folder stands for another policy once the run continues
     config = replace_given(config, robot=options.robot, seed=options.seed, library=options.library, base=base)
     targets = default_targets(config) if options.targets is None else comma_separated(options.targets)

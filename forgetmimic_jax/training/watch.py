@@ -21,12 +21,13 @@ SHOWN = ("success_rate", "survival_weighted_tracking", "tracking_reward", "episo
 
 
 def clip_means(rollout: Rollout, names: Sequence[str]) -> dict[str, dict[str, float]]:
-    """What a row says of every clip."""
+    """What a row says of every clip; `completed` is the success from the first frame."""
     metrics = episode_metrics(rollout)
-    return {
-        clip: {name: round(float(metrics[name][rollout.clip == i].mean()), 4) for name in SHOWN}
-        for i, clip in enumerate(names)
-    }
+    of_clip = {clip: rollout.clip == i for i, clip in enumerate(names)}
+    means = {clip: {name: metrics[name][here] for name in SHOWN} for clip, here in of_clip.items()}
+    for clip, here in of_clip.items():
+        means[clip]["completed"] = metrics["success_rate"][here & (rollout.start_frame == 0)]
+    return {clip: {name: round(float(found.mean()), 4) for name, found in of.items()} for clip, of in means.items()}
 
 
 class Watch:

@@ -17,8 +17,8 @@ from forgetmimic_jax.training.curriculum import (
     step_shares,
 )
 
-# 100 evaluations; phases end at 50, 70 and 90 of them at the latest; patience 2.
-RULES = PretrainConfig(patience=2, gain=0.01, specialist_evaluations=4)
+# 100 evaluations; phases end at 50 and 70 of them at the latest; patience 2.
+RULES = PretrainConfig(patience=2, gain=0.01, mastered=0.9, specialist_evaluations=4)
 CONFIG = dataclasses.replace(Config(), iterations=1000, evaluate_every=10, pretrain=RULES)
 START = Curriculum({name: ClipProgress() for name in ("walk", "kick", "flip")})
 
@@ -28,7 +28,7 @@ def found(walk: float, kick: float, flip: float, success: tuple[float, ...] | No
     trackings = {"walk": walk, "kick": kick, "flip": flip}
     successes = [min(1.0, 1.2 * tracking) for tracking in trackings.values()] if success is None else success
     return {
-        name: Measured(success=rate, tracking=tracking, steps=100.0 * tracking)
+        name: Measured(success=rate, tracking=tracking, steps=100.0 * tracking, completed=rate > 0.0)
         for (name, tracking), rate in zip(trackings.items(), successes, strict=True)
     }
 
@@ -49,24 +49,30 @@ def phases(curriculum: Curriculum, *evaluations: dict[str, Measured], first: int
     return said
 
 
-STALL = [found(0.85, 0.5, 0.1), found(0.8, 0.5, 0.1), found(0.86, 0.5, 0.1)]  # mean 0.4833, then no 0.4933
+STALL = [found(0.85, 0.5, 0.1), found(0.8, 0.5, 0.1), found(0.86, 0.5, 0.1)]  # scores rise by less than 0.01
 LAGGING = after(START, *STALL)
 
 
 def test_a_clips_state_follows_its_success_and_its_progress():
-    clip = ClipProgress()
-    states = []
-    for success, tracking in [(0, 0.1), (0, 0.3), (0.2, 0.305), (0.2, 0.31), (0.2, 0.31), (0.9, 0.31), (0.5, 0.4)]:
-        clip = clip.after(RULES, Measured(success, tracking))
+    clip, states = ClipProgress(), []
+    for success, tracking, completed in [
+        *((0.0, 0.1, False), (0.1, 0.3, False)),  # a late start that reaches the end is no completed clip
+        *((0.2, 0.3, True), (0.2, 0.31, True), (0.2, 0.31, True)),  # then two rises of less than 0.01
+        *((0.9, 0.31, True), (0.5, 0.4, False)),
+    ]:
+        clip = clip.after(RULES, Measured(success, tracking, completed=completed))
         states.append(clip.state(RULES))
-    # The third rise is too small; the fourth is of 0.01 in two evaluations; the last two end a stall of one.
-    assert states == ["new", "new", "learning", "learning", "learning", "mastered", "learning"]
-    assert (clip.record, clip.stalled) == (0.4, 0)
-    stuck = clip.after(RULES, Measured(0.5, 0.40)).after(RULES, Measured(0.5, 0.405))
-    assert (stuck.state(RULES), stuck.stalled) == ("stuck", 2)
+    assert states == ["new", "new", "learning", "learning", "stuck", "mastered", "learning"]
+    assert (clip.record, clip.stalled, clip.completed) == (pytest.approx((0.9 + 0.31) / 2), 1, True)
 
 
-def test_broad_ends_when_the_mean_tracking_makes_no_progress():
+def test_success_alone_is_progress_too():
+    """The kick is tracked as well by a policy that completes it as by one that falls at its end."""
+    clip = ClipProgress().after(RULES, Measured(0.85, 0.78)).after(RULES, Measured(0.95, 0.78))
+    assert (clip.record, clip.stalled) == (pytest.approx(0.865), 0)
+
+
+def test_broad_ends_when_the_mean_score_makes_no_progress():
     rising = [found(0.1 * number, 0.05 * number, 0.1) for number in range(1, 8)]
     assert phases(START, *rising) == ["broad"] * 7
     assert phases(START, *STALL) == ["broad", "broad", "lagging"]
@@ -77,16 +83,18 @@ def test_broad_ends_at_half_of_the_iterations_even_with_progress():
     assert phases(START, *rising)[-2:] == ["broad", "lagging"]
 
 
-def test_the_best_policy_is_the_one_with_the_highest_mean_tracking():
+def test_the_best_policy_is_the_one_with_the_highest_mean_score():
     assert LAGGING.best.number == 3
-    assert LAGGING.best.tracking == pytest.approx((0.86 + 0.5 + 0.1) / 3)
+    # Success is 1.2 times the tracking, at most 1.
+    assert LAGGING.best.score == pytest.approx(((0.86 + 1.0) / 2 + 1.1 * 0.5 + 1.1 * 0.1) / 3)
     worse = after(LAGGING, found(0.2, 0.6, 0.1), first=4)
     assert worse.best == LAGGING.best
 
 
-def test_where_every_clip_is_mastered_only_settling_is_left():
+def test_where_every_clip_is_mastered_the_run_is_done():
     perfect = found(0.8, 0.8, 0.8, (0.9, 1.0, 0.95))
-    assert phases(START, perfect, perfect, perfect) == ["broad", "broad", "settle"]
+    assert phases(START, found(0.8, 0.8, 0.8, (0.9, 1.0, 0.85)), perfect) == ["broad", "done"]
+    assert after(START, perfect).best.number == 1
 
 
 def test_in_the_broad_phase_failing_clips_get_more_steps_and_short_episodes_more_starts():
@@ -124,11 +132,36 @@ def test_lagging_clips_get_three_quarters_of_the_steps_and_mastered_ones_a_kl():
     assert settings_of(CONFIG, later).best_kl == (RULES.best_kl, 0.0, 0.0)
 
 
-def test_lagging_ends_when_every_clip_is_mastered_or_stuck():
-    curve = [found(0.86, 0.5, 0.1), found(0.86, 0.505, 0.1)]
-    assert phases(LAGGING, *curve, first=4) == ["lagging", "stuck kick"]
-    curve = [found(0.86, 0.5, 0.1), found(0.86, 0.6, 0.1), found(0.86, 0.78, 0.1), found(0.86, 0.78, 0.1)]
-    assert phases(LAGGING, *curve, first=4) == ["lagging", "lagging", "stuck flip", "stuck flip"]
+def test_lagging_ends_when_the_mean_stalls_or_every_clip_is_mastered_or_stuck():
+    same = found(0.86, 0.5, 0.1)
+    assert phases(LAGGING, same, found(0.86, 0.505, 0.1), first=4) == ["lagging", "stuck kick"]
+    # The flip goes on, and the kick loses as much: no clip of all is better, but the flip has an expert.
+    curve = [found(0.86, 0.48, 0.12), found(0.86, 0.46, 0.14), found(0.86, 0.44, 0.16)]
+    assert phases(LAGGING, *curve, first=4) == ["lagging", "distil", "stuck kick"]
+    rising = [found(0.86, 0.5 + 0.04 * number, 0.1) for number in range(4)]
+    assert phases(LAGGING, *rising, first=4) == ["lagging"] * 4
+    assert advance(CONFIG, LAGGING, same, 700).phase == "stuck"  # the latest end
+
+
+def test_the_expert_of_a_clip_is_the_policy_that_did_it_best_if_clearly_better_than_the_best():
+    now = after(LAGGING, found(0.2, 0.6, 0.1), found(0.2, 0.61, 0.105), first=4)
+    assert {clip: kept.number for clip, kept in now.experts.items()} == {"kick": 5}  # 0.005 of the flip are too few
+    assert now.best == LAGGING.best
+    better = after(now, found(0.86, 0.608, 0.3), first=6)
+    assert (better.best.number, better.experts) == (6, {})
+
+
+def test_what_single_policies_did_best_is_distilled_before_any_specialist():
+    curve = [found(0.2, 0.7, 0.1), found(0.86, 0.3, 0.3)]
+    now = after(LAGGING, *curve, first=4)
+    assert (now.phase, {clip: kept.number for clip, kept in now.experts.items()}) == ("distil", {"kick": 4, "flip": 5})
+    # The student learned the kick alone, so the flip's specialist starts from the flip's expert.
+    now = advance(CONFIG, now, found(0.86, 0.7, 0.1), 50)
+    assert (now.phase, now.specialists, now.best.number) == ("stuck", ("kick", "flip"), 6)
+    assert now.start == now.best
+    now = advance(CONFIG, now, found(0.1, 0.8, 0.1), 60)
+    assert (now.specialist, now.start.number) == ("flip", 5)
+    assert now.clips["flip"] == ClipProgress(now.start.clips["flip"], now.start.clips["flip"].score, 0, True)
 
 
 STUCK = after(LAGGING, found(0.86, 0.5, 0.1), found(0.86, 0.505, 0.1), first=4)
@@ -136,11 +169,11 @@ STUCK = after(LAGGING, found(0.86, 0.5, 0.1), found(0.86, 0.505, 0.1), first=4)
 
 def test_a_specialist_gets_one_clip_and_starts_from_the_best():
     assert STUCK.specialists == ("kick", "flip")
-    assert (STUCK.stage, STUCK.longest) == (2, 4)
+    assert (STUCK.stage, STUCK.longest, STUCK.start) == (2, 4, STUCK.best)
     settings = settings_of(CONFIG, STUCK)
     assert settings.starts == (0.0, 1.0, 0.0)
     assert settings.best_kl == (0.0, 0.0, 0.0)
-    assert STUCK.clips["kick"] == ClipProgress(STUCK.best.clips["kick"], STUCK.best.clips["kick"].tracking, 0, True)
+    assert STUCK.clips["kick"] == ClipProgress(STUCK.best.clips["kick"], STUCK.best.clips["kick"].score, 0, True)
 
 
 def test_a_specialist_ends_with_its_clip_mastered_stuck_or_its_time():
@@ -149,7 +182,7 @@ def test_a_specialist_ends_with_its_clip_mastered_stuck_or_its_time():
     assert phases(STUCK, *no_progress, first=6) == ["stuck kick", "stuck flip"]
     slow = [found(0.3, 0.52 + 0.02 * number, 0.0) for number in range(4)]
     assert phases(STUCK, *slow, first=6) == ["stuck kick"] * 3 + ["stuck flip"]
-    assert phases(STUCK, *no_progress, *no_progress, first=6)[-1] == "settle"  # no expert: nothing to distil
+    assert phases(STUCK, *no_progress, *no_progress, first=6)[-1] == "done"  # no expert: nothing to distil
 
 
 def test_a_specialists_evaluation_says_nothing_of_other_clips():
@@ -159,59 +192,29 @@ def test_a_specialists_evaluation_says_nothing_of_other_clips():
     assert now.best == STUCK.best
 
 
-def test_an_expert_is_the_specialist_that_tracks_its_clip_best():
-    now = after(STUCK, found(0.1, 0.51, 0.0), first=6)
-    assert now.experts == {}  # no clear gain over the best policy's 0.505
-    now = after(STUCK, found(0.1, 0.6, 0.0), found(0.1, 0.55, 0.0), first=6)
-    assert now.experts["kick"].number == 6
-    now = after(now, found(0.1, 0.7, 0.0), first=8)
-    assert now.experts["kick"].number == 8
-
-
-def test_an_expert_that_the_best_policy_reaches_is_none():
-    now = after(STUCK, found(0.1, 0.6, 0.0), first=6)
-    now = after(now, found(0.9, 0.65, 0.1), first=7)
-    assert now.best.number == 7
-    assert now.experts == {}
-
-
-def test_experts_are_distilled_and_the_rest_lags_again():
+def test_specialists_are_distilled_and_come_again_for_what_is_not_mastered():
     curve = [found(0.3, 0.8, 0.0), found(0.3, 0.5, 0.1), found(0.3, 0.5, 0.1)]
     distil = after(STUCK, *curve, first=6)
-    assert (distil.phase, set(distil.experts)) == ("distil", {"kick"})
-    lagging = advance(CONFIG, distil, found(0.86, 0.79, 0.1), 80)
-    assert (lagging.phase, lagging.experts, lagging.best.number) == ("lagging", {}, 9)
-    assert settings_of(CONFIG, lagging).best_kl == (RULES.best_kl, RULES.best_kl, 0.0)
+    assert (distil.phase, set(distil.experts), distil.start) == ("distil", {"kick"}, STUCK.best)
+    again = advance(CONFIG, distil, found(0.86, 0.8, 0.1), 80)
+    assert (again.phase, again.specialists, again.experts, again.best.number) == ("stuck", ("flip",), {}, 9)
+    assert advance(CONFIG, distil, found(0.86, 0.95, 0.95), 80).phase == "done"
+    assert advance(CONFIG, distil, found(0.86, 0.79, 0.1), 1000).phase == "done"  # no time left
 
 
-def test_where_it_is_too_late_for_lagging_specialists_come_again_until_there_is_no_time_left():
+def test_a_distillation_that_fails_loses_no_expert():
     distil = after(STUCK, found(0.3, 0.8, 0.0), found(0.3, 0.5, 0.1), found(0.3, 0.5, 0.1), first=6)
-    again = advance(CONFIG, distil, found(0.86, 0.79, 0.1), 700)
-    assert (again.phase, again.specialists, again.experts) == ("stuck", ("flip",), {})
-    assert advance(CONFIG, distil, found(0.86, 0.95, 0.95), 700).phase == "settle"
-    assert advance(CONFIG, distil, found(0.86, 0.79, 0.1), 900).phase == "settle"
+    failed = advance(CONFIG, distil, found(0.4, 0.4, 0.1), 80)
+    assert (failed.phase, failed.specialists, failed.best) == ("stuck", ("kick", "flip"), STUCK.best)
+    assert failed.start == failed.experts["kick"] == distil.experts["kick"]
 
 
 def test_specialists_share_the_time_that_is_left():
-    late = dataclasses.replace(LAGGING, stage=9)
-    now = advance(CONFIG, late, found(0.86, 0.6, 0.2), 700)  # lagging ends here; 20 evaluations until 90 %
-    assert (now.phase, now.longest) == ("stuck", 4)
-    now = advance(CONFIG, dataclasses.replace(LAGGING), found(0.86, 0.6, 0.2), 850)
-    assert (now.phase, now.longest) == ("stuck", 2)
-    now = advance(CONFIG, LAGGING, found(0.86, 0.6, 0.2), 900)
-    assert now.phase == "settle"
-
-
-def test_settling_lasts_a_tenth_and_its_kl_falls_to_nothing():
-    now = dataclasses.replace(LAGGING, phase="settle", evaluations=0)
-    kl = []
-    for number in range(10):
-        kl.append(settings_of(CONFIG, now).target_kl)
-        assert settings_of(CONFIG, now).best_kl == (RULES.best_kl,) * 3
-        assert now.phase == "settle"
-        now = advance(CONFIG, now, found(0.86, 0.6, 0.2), 910 + 10 * number)
-    assert now.phase == "done"
-    assert kl == pytest.approx([RULES.target_kl * (0.1 * left) ** 2 for left in range(10, 0, -1)])
+    now = advance(CONFIG, LAGGING, found(0.86, 0.501, 0.1), 940)  # six evaluations for two
+    assert (now.phase, now.longest) == ("stuck", 3)
+    assert advance(CONFIG, LAGGING, found(0.86, 0.501, 0.1), 1000).phase == "done"
+    now = advance(CONFIG, LAGGING, found(0.2, 0.6, 0.1), 1000)
+    assert now.phase == "distil"  # it takes no iterations
 
 
 def test_a_curriculum_is_plain_values():

@@ -12,7 +12,7 @@ from forgetmimic_jax.tracking import env as tracking
 from forgetmimic_jax.tracking.reference import lookup
 from forgetmimic_jax.tracking.rsi import Start
 from forgetmimic_jax.tracking.setup import Setup
-from forgetmimic_jax.training.search import SearchConfig, first_failures, search, straight_lines
+from forgetmimic_jax.training.search import SearchConfig, first_failure, search, straight_lines
 from forgetmimic_jax.training.start import fresh_policy
 
 ROLLOUTS, JOINTS, BODIES, SWAY, TURN = 32, 29, 14, 0, 1
@@ -83,7 +83,7 @@ def survived(env, assets, policy):
 
 @pytest.fixture(scope="module")
 def found(env, assets, policy):
-    failure = int(first_failures(env, assets, policy)[SWAY])
+    failure = first_failure(env, assets, policy, SWAY)
     return search(env, assets, policy, SWAY, failure, CONFIG)
 
 
@@ -93,31 +93,28 @@ def test_straight_lines_between_knots():
     np.testing.assert_allclose(straight_lines(2, 4), [[1, 0], [2 / 3, 1 / 3], [1 / 3, 2 / 3], [0, 1]])
 
 
-def test_first_failures_are_where_a_robot_that_starts_on_the_reference_ends(env, assets, policy, survived):
+def test_the_first_failure_is_where_a_robot_that_starts_on_the_reference_ends(env, assets, policy, survived):
     nothing = np.zeros((60, JOINTS))
     expected = [survived(clip, 0, nothing) for clip in (SWAY, TURN)]
     assert all(5 < frame < 40 for frame in expected)
-    np.testing.assert_array_equal(first_failures(env, assets, policy), expected)
+    assert [first_failure(env, assets, policy, clip) for clip in (SWAY, TURN)] == expected
 
 
 def test_a_clip_that_is_completed_has_no_failure(env, assets, policy):
     short = dataclasses.replace(env, config=dataclasses.replace(env.config, max_episode_steps=5))
-    np.testing.assert_array_equal(first_failures(short, assets, policy), [-1, -1])
-    few = dataclasses.replace(env, num_envs=1)
-    with pytest.raises(ValueError, match="1 robots for 2 clips"):
-        first_failures(few, assets, policy)
+    assert first_failure(short, assets, policy, SWAY) == -1
 
 
 def test_a_robot_that_has_failed_stays_failed(env, assets, policy):
     loose = dataclasses.replace(env.config.termination, anchor_height=9.0, orientation=9.0, end_effector_height=9.0)
     config = dataclasses.replace(env.config, termination=loose)
     stumbling = dataclasses.replace(env, config=config, engine=Stumble())
-    np.testing.assert_array_equal(first_failures(stumbling, assets, policy), [3, 3])
+    assert first_failure(stumbling, assets, policy, SWAY) == 3
 
 
 def test_search_passes_the_frame_at_which_the_policy_fails(env, assets, policy, found, survived):
     """Stepped one by one, what was found survives all steps, and the policy alone does not."""
-    failure = int(first_failures(env, assets, policy)[SWAY])
+    failure = first_failure(env, assets, policy, SWAY)
     assert (found.start, found.steps) == (failure - CONFIG.before, CONFIG.window + CONFIG.after)
     assert found.added.shape == (CONFIG.window, JOINTS)
     after = np.zeros((CONFIG.after, JOINTS))
