@@ -46,7 +46,7 @@ from forgetmimic_jax.training.run import make_iteration
 from forgetmimic_jax.unlearning.registry import method_of
 
 ROOT = Path(__file__).resolve().parents[1]
-COMMANDS = ("train", "unlearn", "evaluate", "import", "evidence")
+COMMANDS = ("train", "pretrain", "unlearn", "evaluate", "import", "evidence")
 LENGTH = 40  # iterations, with a checkpoint after each second one
 AT_START = 0.2  # share of the kills that come at any moment; the others come after the first file was written
 RANDOM = (
@@ -55,6 +55,10 @@ RANDOM = (
     *("ppo.actor_layers=[64]", "ppo.critic_layers=[64]"),
 )
 RANDOM_ITERATIONS = 3
+PHASES = (  # of pretraining, short enough that a run passes all of them
+    *("ppo.schedule=adaptive_iteration", "evaluate_every=4", "evaluate_episodes=4", "pretrain.patience=1"),
+    *("pretrain.distil_rounds=2", "pretrain.search_rounds=3", "pretrain.specialist_evaluations=2"),
+)
 GROWTH = 0.05  # of the memory after a tenth of the time
 PAGE, TMPFS = 2**12, 2**28  # bytes, the least that a disk has, and more than any run here writes
 
@@ -106,6 +110,11 @@ def trained(folder: Path) -> Any:
     return file_hash(newest / POLICY), rows, evaluated(folder) if (folder / "evaluation.json").exists() else None
 
 
+def pretrained(folder: Path) -> Any:
+    """What a training has, the best policy's bytes, and every evaluation, with the phases."""
+    return trained(folder), file_hash(folder / "best" / POLICY), read_rows(folder / "evaluations.jsonl")
+
+
 def evaluated(folder: Path) -> Any:
     """The measured numbers."""
     return json.loads((folder / "evaluation.json").read_text())["policies"]
@@ -149,6 +158,7 @@ def scenes(folder: Path, wanted: Collection[str]) -> dict[str, Scene]:
     write_manifest(library, {"schema": 1, "robot": "g1", "fps": 50.0, "default_targets": ["turn"], "clips": entries})
     length = ("--iterations", str(LENGTH))
     train = ("train", "--library", str(library), *length, "--set", *TINY)
+    phases = ("pretrain", "--library", str(library), "--base", "none", "--episodes", "2", *length)
     base = folder / "base"
     if {"unlearn", "evaluate", "evidence"} & set(wanted):
         undisturbed(Scene(train, "--output", True, trained), base)
@@ -162,6 +172,7 @@ def scenes(folder: Path, wanted: Collection[str]) -> dict[str, Scene]:
     trainings = [f"--{kind}-iterations=8" for kind in ("control", "recovery", "relearning")]
     every = {
         "train": Scene(train, "--output", True, trained),
+        "pretrain": Scene((*phases, "--set", *TINY, *PHASES), "--output", True, pretrained),
         "unlearn": unlearn,
         "evaluate": Scene(measure, "--output", False, evaluated),
         "import": Scene(convert, "--library", False, imported),
