@@ -12,6 +12,8 @@ from miniature import TINY, Run, finished
 
 from forgetmimic_jax import train, unlearn
 from forgetmimic_jax.basics.errors import run_command
+from forgetmimic_jax.evaluation.rollout import Evaluator
+from forgetmimic_jax.evaluation.side_by_side import SideBySide
 from forgetmimic_jax.settings.config import config_hash
 from forgetmimic_jax.training import comparison, run
 
@@ -27,6 +29,37 @@ def compiled_once() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run, "make_iteration", shared)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def rolled_out_once() -> Iterator[None]:
+    """Evaluations on the same episodes of environments with equal settings share what is compiled."""
+    made: dict[tuple, Any] = {}
+
+    def program_of(rolls: Evaluator | SideBySide) -> tuple:
+        """What the compiled functions depend on, beside the shapes of their arguments."""
+        env, own = (
+            (rolls._env, (rolls.clip.tobytes(), rolls.start_frame.tobytes(), rolls._seed))
+            if isinstance(rolls, Evaluator)
+            else (rolls.env, (rolls.names, rolls._starts))
+        )
+        config, robot = env.config, [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(env.robot.arrays)]
+        settings = (config.physics, config.observation, config.action, config.reward, config.termination, config.noise)
+        rest = (config.max_episode_steps, env.num_envs, env.noisy, env.runs_on, env.replace_reference)
+        return (type(rolls), *own, *robot, str(settings), *rest)
+
+    def shared(make: Callable[..., None]) -> Callable[..., None]:
+        def init(self, *given, **more) -> None:
+            make(self, *given, **more)
+            for name in ("_begin", "_advance"):
+                setattr(self, name, made.setdefault((name, *program_of(self)), getattr(self, name)))
+
+        return init
+
+    with pytest.MonkeyPatch.context() as patch:
+        for kind in (Evaluator, SideBySide):
+            patch.setattr(kind, "__init__", shared(kind.__init__))
         yield
 
 
