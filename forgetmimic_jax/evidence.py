@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from forgetmimic_jax.training.checkpoint import CheckpointInfo
 
 
+AGAIN = "distilled again"  # what is judged beside the fakes, and is none
+
+
 @dataclass
 class Options:
     """Try to bring back what a run forgot, beside its base and a control that never rolled out a target.
@@ -193,14 +196,28 @@ def _make_control(options: Options, info: CheckpointInfo, base: Path, folder: Pa
 
 
 def _unlearn(info: CheckpointInfo, base: Path, folder: Path, **given: Any) -> None:
-    """A run on the robot, base, clips and targets of another, unless it is finished; one that stopped continues."""
+    """A run on the robot, base, clips and targets of another, unless it is finished; one that stopped continues.
+
+    Raises:
+        InputError: the folder has a run of another base or of other targets.
+    """
     from forgetmimic_jax import unlearn
     from forgetmimic_jax.attacks import control
-    from forgetmimic_jax.training.checkpoint import newest_checkpoint, read_info
+    from forgetmimic_jax.training.checkpoint import newest_checkpoint, policy_hash, read_info
 
+    config = info.config
+    if newest_checkpoint(folder):
+        found, wanted = read_info(folder), policy_hash(read_info(base))
+        for name, theirs, ours in (
+            ("base", found.base, wanted),
+            ("unlearn.targets", sorted(found.config.unlearn.targets), sorted(config.unlearn.targets)),
+        ):
+            if theirs != ours:
+                raise InputError(
+                    f"{folder}: {name}: found {theirs}; accepted: {ours}; remove the folder to make it again"
+                )
     if control.is_finished(folder):
         return
-    config = info.config
     unlearn.main(
         unlearn.Options(
             robot=config.robot,
@@ -226,7 +243,9 @@ def _judge_fakes(
     from forgetmimic_jax.attacks.document import write_document
     from forgetmimic_jax.attacks.fakes import fakes
     from forgetmimic_jax.attacks.judged import FILE, Judged, judged
+    from forgetmimic_jax.basics.console import warn
     from forgetmimic_jax.evaluation.metrics import BASE
+    from forgetmimic_jax.evaluation.verdict import CONSISTENT, FAILED
     from forgetmimic_jax.policy.policy import Policy
     from forgetmimic_jax.training import checkpoint
 
@@ -243,12 +262,16 @@ def _judge_fakes(
     policies = {
         **fakes(case.setup, own, case.chosen(case.targets), case.chosen(case.kept)),
         "λ = 8": lambda: trained("lambda-8", penalty=8.0, iterations=iterations, seed=seed),
-        "distilled again": lambda: trained("distilled", method=control.METHOD, iterations=iterations, seed=seed + 2),
+        AGAIN: lambda: trained("distilled", method=control.METHOD, iterations=iterations, seed=seed + 2),
     }
     found: dict[str, Judged] = {}
     for name, make in policies.items():
         found[name] = judged(case, parts, name, make(), evidence)
         Console().print(f"{name}: {found[name].phrase}", highlight=False, markup=False)
+        if name == AGAIN and found[name].phrase != CONSISTENT:
+            warn(f"{name}: the verdict should be {CONSISTENT}, since this policy never saw a target")
+        if name != AGAIN and found[name].phrase != FAILED:
+            warn(f"{name}: the verdict should be {FAILED}, since nothing was forgotten; more episodes may decide it")
     write_document(options.run / FILE, found)
 
 

@@ -192,6 +192,30 @@ def test_the_fakes_and_another_distilled_policy_are_judged(run, printed, monkeyp
     assert trained["run-control"] == {"method": "distill", "iterations": 1, "seed": 1}
 
 
+def test_a_fake_that_passes_is_said(run, printed, monkeypatch, capfd):
+    monkeypatch.setattr(evidence, "_unlearn", lambda info, base, folder, **given: None)
+    monkeypatch.setattr(fakes, "fakes", lambda *given: {"the base itself": lambda: None})
+    monkeypatch.setattr(judged, "judged", lambda *given: judged.Judged("inconclusive", ("Not sure.",)))
+    for name in ("run-lambda-8", "run-distilled"):
+        shutil.copytree(run, run.with_name(name), dirs_exist_ok=True)
+    evidence.main(evidence.Options(run=run, fakes=True, **SMALL))
+    warned = [line for line in capfd.readouterr().err.splitlines() if "should be" in line]
+    assert [line.split(":")[1].strip() for line in warned] == ["the base itself", "λ = 8", "distilled again"]
+    assert "the verdict should be consistent with retraining" in warned[-1]
+    assert all("the verdict should be failed" in line for line in warned[:-1])
+
+
+def test_a_run_of_other_targets_beside_is_refused(run, base_run, tmp_path):
+    folder = Path(shutil.copytree(run, tmp_path / "run-lambda-8"))
+    for path in folder.rglob("config.yaml"):
+        path.write_text(path.read_text().replace("  - turn\n", "  - nod\n"))
+    message = (
+        r"run-lambda-8: unlearn.targets: found \['nod'\]; accepted: \['turn'\]; remove the folder to make it again"
+    )
+    with pytest.raises(InputError, match=message):
+        evidence._unlearn(read_info(run), base_run.checkpoint(4), folder, penalty=8.0)
+
+
 def test_every_run_to_attack_is_a_task(run, tmp_path, monkeypatch):
     runs, where = [shutil.copytree(run, tmp_path / name) for name in ("a", "b")], {"jobs": 3, "cluster": "tcp://a:8786"}
     given = []
