@@ -84,8 +84,6 @@ class Scene:
     def start(self, folder: Path) -> subprocess.Popen:
         """The command, as it starts or continues in the folder."""
         resume = self.resumes and newest_checkpoint(folder) is not None
-        if self.resumes and not resume:
-            shutil.rmtree(folder, ignore_errors=True)  # nothing in it to continue with
         named = folder
         if self.run is not None:
             named = folder / self.run.name

@@ -10,11 +10,17 @@ best/               with evaluations during training: the policy that did best o
 from __future__ import annotations
 
 import os
+import shutil
 from pathlib import Path
 
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.training.checkpoint import BEST as BEST
 from forgetmimic_jax.training.checkpoint import newest_checkpoint
+
+BEGUN = "metrics.jsonl"  # has a row as soon as a run has made an iteration
+AT_FIRST = {  # what a run writes before its first checkpoint, with an evaluation of what it starts from
+    *("config.yaml", BEGUN, "events", "checkpoints", "evaluations.jsonl", "evaluations.png", BEST, "policies"),
+}
 
 
 def folder_of(path: Path) -> Path | None:
@@ -35,6 +41,8 @@ def default_folder(kind: str, *, resume: bool) -> Path:
 def prepare_folder(directory: Path, *, resume: bool) -> Path | None:
     """The newest checkpoint to resume from; without `resume` the folder must be new or empty.
 
+    What a run left that was killed before its first checkpoint is removed.
+
     Raises:
         InputError: the folder exists or cannot be written, or there is nothing to resume.
     """
@@ -45,9 +53,19 @@ def prepare_folder(directory: Path, *, resume: bool) -> Path | None:
             raise InputError(f"{directory}: --resume finds no checkpoint there; leave it out to start")
         return newest
     if directory.exists() and any(directory.iterdir()):
+        if _has_nothing(directory):
+            shutil.rmtree(directory)
+            return None
         other = "continue with --resume" if newest_checkpoint(directory) else "remove it"
         raise InputError(f"{directory}: exists already; choose another --output, or {other}")
     return None
+
+
+def _has_nothing(directory: Path) -> bool:
+    """Whether a folder is that of a run that was killed before its first checkpoint."""
+    names, log = {path.name for path in directory.iterdir()}, directory / BEGUN
+    rows = log.is_file() and log.stat().st_size > 0
+    return "config.yaml" in names and names <= AT_FIRST and not rows and newest_checkpoint(directory) is None
 
 
 def check_writable(directory: Path) -> None:

@@ -313,6 +313,24 @@ def test_a_folder_must_be_new(tmp_path):
             prepare_folder(path, resume=False)
 
 
+def test_what_a_run_left_that_was_killed_before_its_first_checkpoint_is_removed(tmp_path):
+    run = tmp_path / "run"
+    (run / "checkpoints" / ".00000000.tmp").mkdir(parents=True)
+    for name in ("config.yaml", "metrics.jsonl"):
+        (run / name).touch()
+    assert prepare_folder(run, resume=False) is None
+    assert not run.exists()
+
+
+@pytest.mark.parametrize("kept", ["metrics.jsonl", "note"])
+def test_a_folder_with_anything_of_worth_is_not_removed(tmp_path, kept):
+    (tmp_path / "config.yaml").touch()
+    (tmp_path / kept).write_text("{}")
+    with pytest.raises(InputError, match=r"exists already; choose another --output, or remove it$"):
+        prepare_folder(tmp_path, resume=False)
+    assert (tmp_path / kept).read_text() == "{}"
+
+
 def test_a_folder_without_permission_is_told(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "access", lambda _path, _mode: False)  # which root would have everywhere
     with pytest.raises(InputError, match=rf"no permission to write in {tmp_path}; choose another --output"):
