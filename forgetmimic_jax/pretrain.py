@@ -154,7 +154,8 @@ def config_of(options: Options, output: Path) -> Config:
     options = dataclasses.replace(options, without=",".join(without) or None)
     if options.resume:
         config = load_config(output / "config.yaml")
-        check_same(options, {name: getattr(config, name) for name in ("robot", "preset", "seed", "library", "base")})
+        check_same(options, {name: getattr(config, name) for name in ("robot", "preset", "seed", "library")})
+        check_same(options, {"base": config.base or "none"})
         check_same(options, {"without": ",".join(config.unlearn.targets)})
     else:
         base = options.base or (shipped_base(options.robot) if options.library and not without else None)

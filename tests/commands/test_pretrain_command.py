@@ -43,6 +43,15 @@ def test_a_library_of_ones_own_starts_from_the_shipped_base_with_its_observation
     assert found.observation == load_config(other / "config.yaml").observation != Config().observation
 
 
+def test_the_same_command_continues_a_run_from_a_random_policy(library_folder, tmp_path):
+    fresh = pretrain.Options(library=library_folder, base=Path("none"))
+    save_config(pretrain.config_of(fresh, tmp_path), tmp_path / "config.yaml")
+    again = dataclasses.replace(fresh, resume=True)
+    assert pretrain.config_of(again, tmp_path) == pretrain.config_of(fresh, tmp_path)
+    with pytest.raises(InputError, match="--base: found other, but the run to resume has none; leave the flag out"):
+        pretrain.config_of(dataclasses.replace(again, base=Path("other")), tmp_path)
+
+
 def test_a_control_is_trained_from_nothing_without_its_clips(library_folder, refused, tmp_path):
     found = config_of(library=library_folder, without=" turn, nod")
     assert (found.base, found.unlearn.targets, found.unlearn.method) == (None, ("turn", "nod"), "retrain")
