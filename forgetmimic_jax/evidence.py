@@ -55,8 +55,6 @@ class Options:
 
 def main(options: Options) -> None:
     """Find or make the control, attack, judge and write."""
-    from rich.console import Console
-
     from forgetmimic_jax.attacks import control, gather
     from forgetmimic_jax.attacks.case import Case
     from forgetmimic_jax.attacks.document import CONTROL, FILE, write_document
@@ -66,7 +64,7 @@ def main(options: Options) -> None:
     from forgetmimic_jax.attacks.page import page
     from forgetmimic_jax.attacks.parts import Parts
     from forgetmimic_jax.attacks.verdict import judge
-    from forgetmimic_jax.basics.console import closing, command_line
+    from forgetmimic_jax.basics.console import closing, command_line, say
     from forgetmimic_jax.basics.files import write_atomically
     from forgetmimic_jax.basics.provenance import provenance
     from forgetmimic_jax.evaluation.metrics import BASE, UNLEARNED
@@ -124,8 +122,7 @@ def main(options: Options) -> None:
     text = page(document, files["figure"].name, command, read_judged(run / JUDGED))
     write_atomically(files["page"], text.encode())
     verdict = judge(document)
-    console = Console()
-    console.print(f"{verdict.phrase}: {' '.join(verdict.reasons)}", highlight=False, markup=False, soft_wrap=True)
+    say(f"{verdict.phrase}: {' '.join(verdict.reasons)}")
     closing(files, command_line("report", run=run))
 
 
@@ -220,12 +217,11 @@ def _judge_fakes(
     options: Options, case: Case, parts: Parts, evidence: EvidenceDocument, info: CheckpointInfo, base: Path
 ) -> None:
     """Judge every fake and another distilled policy, and write the verdicts."""
-    from rich.console import Console
-
     from forgetmimic_jax.attacks import control
     from forgetmimic_jax.attacks.document import write_document
     from forgetmimic_jax.attacks.fakes import fakes
     from forgetmimic_jax.attacks.judged import FILE, Judged, judged
+    from forgetmimic_jax.basics.console import say
     from forgetmimic_jax.evaluation.metrics import BASE
     from forgetmimic_jax.policy.policy import Policy
     from forgetmimic_jax.training import checkpoint
@@ -248,7 +244,7 @@ def _judge_fakes(
     found: dict[str, Judged] = {}
     for name, make in policies.items():
         found[name] = judged(case, parts, name, make(), evidence)
-        Console().print(f"{name}: {found[name].phrase}", highlight=False, markup=False)
+        say(f"{name}: {found[name].phrase}")
     write_document(options.run / FILE, found)
 
 
