@@ -17,7 +17,7 @@ import msgspec
 from forgetmimic_jax.attacks.document import write_document
 from forgetmimic_jax.basics.console import Show
 from forgetmimic_jax.basics.errors import InputError
-from forgetmimic_jax.basics.files import write_atomically
+from forgetmimic_jax.basics.files import write_json
 from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.tracking.env import make_assets
 from forgetmimic_jax.tracking.rsi import initial_failure_level
@@ -55,7 +55,7 @@ class Parts:
                     )
             return
         folder.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, (json.dumps(ours, indent=2) + "\n").encode())
+        write_json(path, ours)
 
     def has(self, name: str) -> bool:
         """Whether a part is finished."""

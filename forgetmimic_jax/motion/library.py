@@ -19,7 +19,7 @@ from flax import struct
 from jax import Array
 
 from forgetmimic_jax.basics.errors import InputError, nearest
-from forgetmimic_jax.basics.files import write_atomically
+from forgetmimic_jax.basics.files import write_json
 from forgetmimic_jax.basics.places import shipped
 from forgetmimic_jax.motion.clip import Clip, read_clip, write_clip
 from forgetmimic_jax.motion.kinematics import body_motion, configuration, rate, resample
@@ -101,12 +101,6 @@ def only_clips(library: MotionLibrary, names: Sequence[str]) -> MotionLibrary:
     return _one_after_the_other([library.clip(library.names.index(name)) for name in names], names)
 
 
-def together(*libraries: MotionLibrary) -> MotionLibrary:
-    """The clips of several libraries."""
-    rows = [library.clip(clip) for library in libraries for clip in range(len(library.names))]
-    return _one_after_the_other(rows, [name for library in libraries for name in library.names])
-
-
 def read_library(robot: Robot, path: Path | None = None, clips: Sequence[str] | None = None) -> list[Clip]:
     """The library's clips as they are on disk; arguments and errors as in `load_library`."""
     path = DATA_DIR / robot.name if path is None else Path(path)
@@ -154,7 +148,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
 
 def write_manifest(path: Path, manifest: dict[str, Any]) -> None:
     """Write the folder's manifest in one atomic step."""
-    write_atomically(path / MANIFEST, (json.dumps(manifest, indent=2) + "\n").encode())
+    write_json(path / MANIFEST, manifest)
 
 
 def manifest_for(path: Path, robot: Robot, name: str, fps: float, *, overwrite: bool = False) -> dict[str, Any]:
