@@ -187,6 +187,13 @@ def test_a_damaged_or_foreign_file_is_refused_in_one_line(tmp_path, document, ch
     assert "\n" not in str(error.value)
 
 
+def test_an_older_evaluation_is_of_residual_actions(tmp_path, document):
+    content = to_dict(document)
+    content.pop("action_mode", None)
+    (tmp_path / "evaluation.json").write_text(json.dumps(content))
+    assert read_evaluation(tmp_path / "evaluation.json").action_mode == "residual"
+
+
 def test_no_file_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"none\.json: not found"):
         read_evaluation(tmp_path / "none.json")

@@ -130,13 +130,6 @@ def test_teaching_starts_every_taught_clip_alike(assets):
     np.testing.assert_allclose(alone.probabilities.sum(-1), [0.0, 1.0], rtol=1e-6)
 
 
-def test_a_clip_has_one_teacher(assets):
-    with pytest.raises(ValueError, match=r"found \[1, 1\]"):
-        make_teaching(assets, [(Witness(), (TURN,)), (Witness(), (TURN,))])
-    with pytest.raises(ValueError, match=r"found \[\]"):
-        make_teaching(assets, [])
-
-
 @pytest.mark.parametrize("noisy", [False, True])
 def test_noise_follows_the_environment(env, assets, policy, noisy):
     """Without noise both see the clean observation, to the last digit; with noise both see the same noisy one."""
