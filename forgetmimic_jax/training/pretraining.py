@@ -185,7 +185,7 @@ class Pretraining:
             return policy, 0
         size = SearchConfig(rounds=max(1, round(0.6 * rounds)), noisy_rounds=max(1, round(0.4 * rounds)))
         found = search(self._env, assets, policy, index, failure, size)
-        used = (size.rounds + size.noisy_rounds + 3) * robots * found.steps
+        used = (size.rounds + size.noisy_rounds + 1) * robots * found.steps
         say(
             f"{clip}: falls at frame {failure}; a search passes it in {found.passed:.0%} of the rollouts", self._console
         )
@@ -210,8 +210,8 @@ class Pretraining:
         assets, robots = self._assets(student), self._env.num_envs
         teaching = make_teaching(assets, [(PolicyTeacher(policy), clips) for policy, clips in taught], shown)
         start = begin(self._env, assets, teaching, student, key)
-        result = distil(self._env, assets, teaching, start, config)
-        return result.state.student, int(result.state.round) * robots * config.steps
+        end = distil(self._env, assets, teaching, start, config)
+        return end.student, int(end.round) * robots * config.steps
 
     def _policy_folder(self, number: int) -> Path:
         return self._directory / POLICIES / f"{number:04d}"
