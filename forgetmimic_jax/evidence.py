@@ -27,7 +27,7 @@ class Options:
     run's folder evidence/; the same command continues. The report takes its verdict from evidence.json.
     """
 
-    run: Path
+    run: str
     """Folder of the run. Several, comma-separated, are attacked side by side; those that have an evidence.json already
     are left as they are."""
     control: Path | None = None
@@ -76,10 +76,10 @@ def main(options: Options) -> None:
     from forgetmimic_jax.training.comparison import load_comparison
 
     provenance()  # of the code that is loaded now; a checkout may change while attacks train
-    scale, runs = _scale(options), [Path(name) for name in comma_separated(str(options.run))]
+    scale, runs = _scale(options), [Path(name) for name in comma_separated(options.run)]
     if len(runs) > 1 or options.cluster:
         return _several(options, runs)
-    run = options.run
+    run = runs[0]
     newest, info = _unlearned(run)
     compared = load_comparison(newest, robot=info.robot, base=options.base)
     setup, base = compared.setup, compared.info["base"]
@@ -117,7 +117,7 @@ def main(options: Options) -> None:
     if options.fakes:
         _judge_fakes(options, case, parts, document, info, base.path)
     names = [field.name for field in dataclasses.fields(options) if field.name not in ("jobs", "cluster")]
-    given = {name: getattr(options, name) or None for name in names}
+    given = {name: getattr(options, name) or None for name in names} | {"run": run}
     command = command_line("evidence", **given)
     text = page(document, files["figure"].name, command, read_judged(run / JUDGED))
     write_atomically(files["page"], text.encode())
@@ -152,7 +152,7 @@ def _several(options: Options, runs: Sequence[Path]) -> None:
     tasks = []
     for run in runs:
         _unlearned(run)
-        flags = flags_of(dataclasses.replace(options, run=run, jobs=1, cluster=None))
+        flags = flags_of(dataclasses.replace(options, run=str(run), jobs=1, cluster=None))
         tasks.append(Task(run, "evidence", flags, iterations=0, last=FILE, adds=True))
     following = command_line("report", run=runs[0])
     run_together(tasks, following, description="evidence", jobs=options.jobs, cluster=options.cluster)
@@ -226,8 +226,10 @@ def _judge_fakes(
     from forgetmimic_jax.policy.policy import Policy
     from forgetmimic_jax.training import checkpoint
 
+    run = Path(options.run)
+
     def trained(name: str, **given: Any) -> Policy:
-        folder = options.run.with_name(f"{options.run.name}-{name}")
+        folder = run.with_name(f"{run.name}-{name}")
         _unlearn(info, base, folder, **given)
         newest = checkpoint.newest_checkpoint(folder)
         assert newest is not None
@@ -245,7 +247,7 @@ def _judge_fakes(
     for name, make in policies.items():
         found[name] = judged(case, parts, name, make(), evidence)
         say(f"{name}: {found[name].phrase}")
-    write_document(options.run / FILE, found)
+    write_document(run / FILE, found)
 
 
 if __name__ == "__main__":

@@ -71,7 +71,7 @@ def main(options: Options) -> None:
     """Read, roll out, compare and write."""
     from forgetmimic_jax.basics.console import closing, command_line
     from forgetmimic_jax.exchange.adopt import LIBRARY, read_reference, write_base
-    from forgetmimic_jax.exchange.foreign import Reading, read_policy
+    from forgetmimic_jax.exchange.foreign import PolicyReading, read_policy
     from forgetmimic_jax.policy.gaussian import MAX_STD, MIN_STD
     from forgetmimic_jax.robot.model import load_robot
     from forgetmimic_jax.settings.config import preset
@@ -91,7 +91,7 @@ def main(options: Options) -> None:
     references = read_reference(options.reference)
     robot = load_robot(options.robot)
     config = replace_given(preset(options.preset), robot=options.robot, library=options.library, seed=options.seed)
-    reading = Reading(
+    reading = PolicyReading(
         activation=options.activation, fps=options.fps, start=options.start, own_clip=options.library is None
     )
     if len(options.files) == 1:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -127,10 +126,7 @@ def from_second(clip: Clip, start: float) -> Clip:
         raise InputError(
             f"--start: found {start:g}; {clip.name} has {clip.seconds:.2f} s, and half a second must remain"
         )
-    first = int(np.ceil(start * clip.fps - 1e-6))
-    return dataclasses.replace(
-        clip, root_pos=clip.root_pos[first:], root_quat=clip.root_quat[first:], joint_pos=clip.joint_pos[first:]
-    )
+    return clip.part(int(np.ceil(start * clip.fps - 1e-6)), clip.num_frames)
 
 
 def garbage(robot: Robot, clip: Clip) -> str | None:

@@ -85,6 +85,10 @@ class Robot:
         """The joints in the order of a policy's inputs and outputs."""
         return tuple(self.joint_names[joint] for joint in self.policy_joints)
 
+    def beyond(self, joint_pos: np.ndarray) -> np.ndarray:
+        """How far joint angles [..., joint] are beyond the joints' ranges, rad; below 0 inside them."""
+        return np.maximum(joint_pos - self.joint_upper, self.joint_lower - joint_pos)
+
     @property
     def weight(self) -> float:
         """Of the whole robot, N."""

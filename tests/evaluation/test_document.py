@@ -122,11 +122,6 @@ def test_success_from_frame_0_counts_the_episodes_that_start_there(make_rollout)
     assert (found.mean, found.n, base.target.success_rate.n) == (0.5, 2, 3)
 
 
-def test_an_unknown_target_names_the_nearest_clip(rollouts):
-    with pytest.raises(InputError, match="no clip 'pnch' in the library; did you mean 'punch'"):
-        evaluate_policies(rollouts, NAMES, ["pnch"], seed=0)
-
-
 def test_one_episode_a_clip_writes_no_nan(tmp_path, make_rollout, document):
     rollouts = {"base": make_rollout([0, 1], [10, 10], [10, 4], [0.9, 0.9])}
     policies = evaluate_policies(rollouts, ["a", "b"], ["b"], seed=0)
