@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import serialization, struct
+from trees import assert_same
 
 from forgetmimic_jax.policy.policy import init_policy
 from forgetmimic_jax.tracking import env as tracking
@@ -212,7 +213,7 @@ def test_statistics_are_learned_and_then_frozen(rolled, one_round, assets, two):
     late = dataclasses.replace(after, round=jnp.asarray(CONFIG.normalizer_rounds, jnp.int32))
     frozen, _ = one_round(assets, two, late)
     for name in ("actor_normalizer", "critic_normalizer"):
-        jax.tree.map(np.testing.assert_array_equal, getattr(frozen.student, name), getattr(late.student, name))
+        assert_same(getattr(frozen.student, name), getattr(late.student, name))
     moved = jax.tree.map(lambda a, b: bool((a != b).any()), frozen.student.actor, late.student.actor)
     assert moved["params"]["MLP_0"]["Dense_2"]["kernel"]
 
@@ -297,7 +298,7 @@ def test_interrupted_and_restored_it_ends_with_the_same_bits(env, assets, two, p
     assert int(restored.round) == 2
     for _ in range(2):
         restored, _ = one_round(assets, two, restored)
-    jax.tree.map(np.testing.assert_array_equal, restored, state)
+    assert_same(restored, state)
 
 
 def test_lessons_that_are_shown_are_learned(env, assets, policy):
