@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from forgetmimic_jax.basics.errors import InputError, run_command
-from forgetmimic_jax.basics.files import write_atomically
+from forgetmimic_jax.basics.files import write_json
 from forgetmimic_jax.basics.provenance import cores, made_here
 from forgetmimic_jax.settings.config import EngineName, Preset
 from forgetmimic_jax.settings.options import at_least, comma_separated, on_engine, parse, replace_given
@@ -88,7 +88,7 @@ def main(options: Options) -> None:
     if options.output:
         options.output.parent.mkdir(parents=True, exist_ok=True)
         document = {**figures, "made": dataclasses.asdict(made_here())}
-        write_atomically(options.output, (json.dumps(document, indent=2) + "\n").encode())
+        write_json(options.output, document)
         print(f"figures  {options.output}")
 
 

@@ -30,7 +30,7 @@ class Options:
     run's folder evidence/; the same command continues. The report takes its verdict from evidence.json.
     """
 
-    run: Path
+    run: str
     """Folder of the run. Several, comma-separated, are attacked side by side; those that have an evidence.json already
     are left as they are."""
     control: Path | None = None
@@ -58,8 +58,6 @@ class Options:
 
 def main(options: Options) -> None:
     """Find or make the control, attack, judge and write."""
-    from rich.console import Console
-
     from forgetmimic_jax.attacks import control, gather
     from forgetmimic_jax.attacks.case import Case
     from forgetmimic_jax.attacks.document import CONTROL, FILE, write_document
@@ -69,7 +67,7 @@ def main(options: Options) -> None:
     from forgetmimic_jax.attacks.page import page
     from forgetmimic_jax.attacks.parts import Parts
     from forgetmimic_jax.attacks.verdict import judge
-    from forgetmimic_jax.basics.console import closing, command_line
+    from forgetmimic_jax.basics.console import closing, command_line, say
     from forgetmimic_jax.basics.files import write_atomically
     from forgetmimic_jax.basics.provenance import provenance
     from forgetmimic_jax.evaluation.metrics import BASE, UNLEARNED
@@ -81,10 +79,10 @@ def main(options: Options) -> None:
     from forgetmimic_jax.training.comparison import load_comparison
 
     provenance()  # of the code that is loaded now; a checkout may change while attacks train
-    scale, runs = _scale(options), [Path(name) for name in comma_separated(str(options.run))]
+    scale, runs = _scale(options), [Path(name) for name in comma_separated(options.run)]
     if len(runs) > 1 or options.cluster:
         return _several(options, runs)
-    run = options.run
+    run = runs[0]
     newest, info = _unlearned(run)
     compared = load_comparison(newest, robot=info.robot, base=options.base)
     setup, base = compared.setup, compared.info["base"]
@@ -122,13 +120,12 @@ def main(options: Options) -> None:
     if options.fakes:
         _judge_fakes(options, case, parts, document, info, base.path)
     names = [field.name for field in dataclasses.fields(options) if field.name not in ("jobs", "cluster")]
-    given = {name: getattr(options, name) or None for name in names}
+    given = {name: getattr(options, name) or None for name in names} | {"run": run}
     command = command_line("evidence", **given)
     text = page(document, files["figure"].name, command, read_judged(run / JUDGED))
     write_atomically(files["page"], text.encode())
     verdict = judge(document)
-    console = Console()
-    console.print(f"{verdict.phrase}: {' '.join(verdict.reasons)}", highlight=False, markup=False, soft_wrap=True)
+    say(f"{verdict.phrase}: {' '.join(verdict.reasons)}")
     closing(files, command_line("report", run=run))
 
 
@@ -158,7 +155,7 @@ def _several(options: Options, runs: Sequence[Path]) -> None:
     tasks = []
     for run in runs:
         _unlearned(run)
-        flags = flags_of(dataclasses.replace(options, run=run, jobs=1, cluster=None))
+        flags = flags_of(dataclasses.replace(options, run=str(run), jobs=1, cluster=None))
         tasks.append(Task(run, "evidence", flags, iterations=0, last=FILE, adds=True))
     following = command_line("report", run=runs[0])
     run_together(tasks, following, description="evidence", jobs=options.jobs, cluster=options.cluster)
@@ -237,20 +234,20 @@ def _judge_fakes(
     options: Options, case: Case, parts: Parts, evidence: EvidenceDocument, info: CheckpointInfo, base: Path
 ) -> None:
     """Judge every fake and another distilled policy, and write the verdicts."""
-    from rich.console import Console
-
     from forgetmimic_jax.attacks import control
     from forgetmimic_jax.attacks.document import write_document
     from forgetmimic_jax.attacks.fakes import fakes
     from forgetmimic_jax.attacks.judged import FILE, Judged, judged
-    from forgetmimic_jax.basics.console import warn
+    from forgetmimic_jax.basics.console import say, warn
     from forgetmimic_jax.evaluation.metrics import BASE
     from forgetmimic_jax.evaluation.verdict import CONSISTENT, FAILED
     from forgetmimic_jax.policy.policy import Policy
     from forgetmimic_jax.training import checkpoint
 
+    run = Path(options.run)
+
     def trained(name: str, **given: Any) -> Policy:
-        folder = options.run.with_name(f"{options.run.name}-{name}")
+        folder = run.with_name(f"{run.name}-{name}")
         _unlearn(info, base, folder, **given)
         newest = checkpoint.newest_checkpoint(folder)
         assert newest is not None
@@ -267,12 +264,12 @@ def _judge_fakes(
     found: dict[str, Judged] = {}
     for name, make in policies.items():
         found[name] = judged(case, parts, name, make(), evidence)
-        Console().print(f"{name}: {found[name].phrase}", highlight=False, markup=False)
+        say(f"{name}: {found[name].phrase}")
         if name == AGAIN and found[name].phrase != CONSISTENT:
             warn(f"{name}: the verdict should be {CONSISTENT}, since this policy never saw a target")
         if name != AGAIN and found[name].phrase != FAILED:
             warn(f"{name}: the verdict should be {FAILED}, since nothing was forgotten; more episodes may decide it")
-    write_document(options.run / FILE, found)
+    write_document(run / FILE, found)
 
 
 if __name__ == "__main__":

@@ -52,7 +52,7 @@ def main(options: Options) -> None:
     import yaml
     from rich.console import Console
 
-    from forgetmimic_jax.basics.console import closing, command_line, progress
+    from forgetmimic_jax.basics.console import closing, command_line, progress, say
     from forgetmimic_jax.basics.files import write_atomically
     from forgetmimic_jax.evaluation.rollout import Evaluator
     from forgetmimic_jax.exchange.closed_loop import run_episodes
@@ -112,12 +112,10 @@ def main(options: Options) -> None:
     if beside:
         files["for its deployer"] = output.with_name(beside[0])
         write_atomically(output.with_name(beside[0]), yaml.safe_dump(beside[1], sort_keys=False).encode())
-    console = Console()
-    console.print(_table(setup.library.names, evaluation, record.rollout))
-    console.print(
+    Console().print(_table(setup.library.names, evaluation, record.rollout))
+    say(
         f"{len(record.actions):,} actions equal the policy's to {error:.0e}; in {early:.0%} of the episodes' first "
-        f"{EARLY_STEPS} steps tracking equals the evaluation's to {EARLY_TOLERANCE:.0e}; rounding grows at contacts.",
-        highlight=False,
+        f"{EARLY_STEPS} steps tracking equals the evaluation's to {EARLY_TOLERANCE:.0e}; rounding grows at contacts."
     )
     closing(
         files,

@@ -71,7 +71,7 @@ def main(options: Options) -> None:
     """Read, roll out, compare and write."""
     from forgetmimic_jax.basics.console import closing, command_line
     from forgetmimic_jax.exchange.adopt import LIBRARY, read_reference, write_base
-    from forgetmimic_jax.exchange.foreign import Reading, read_policy
+    from forgetmimic_jax.exchange.foreign import PolicyReading, read_policy
     from forgetmimic_jax.policy.gaussian import MAX_STD, MIN_STD
     from forgetmimic_jax.robot.model import load_robot
     from forgetmimic_jax.settings.config import preset
@@ -91,7 +91,7 @@ def main(options: Options) -> None:
     references = read_reference(options.reference)
     robot = load_robot(options.robot)
     config = replace_given(preset(options.preset), robot=options.robot, library=options.library, seed=options.seed)
-    reading = Reading(
+    reading = PolicyReading(
         activation=options.activation, fps=options.fps, start=options.start, own_clip=options.library is None
     )
     if len(options.files) == 1:
@@ -110,7 +110,7 @@ def main(options: Options) -> None:
 
 def _one(options: Options, foreign: ForeignPolicy, config: Config, references: References) -> Adopted:
     """A policy as it is; prints what was read of it and how it did."""
-    from forgetmimic_jax.basics.console import warn
+    from forgetmimic_jax.basics.console import say, warn
     from forgetmimic_jax.exchange.adopt import adopt, check_reference, falls
     from forgetmimic_jax.exchange.imported import notes
 
@@ -118,7 +118,7 @@ def _one(options: Options, foreign: ForeignPolicy, config: Config, references: R
     check_reference(options.reference, references, made.trial.clips)
     _say_read(foreign)
     _say_figures({"": made.trial.clips})
-    _say("\n".join([*made.facts, *notes(foreign.actor, options.std)]))
+    say("\n".join([*made.facts, *notes(foreign.actor, options.std)]))
     if doubt := falls(foreign, made.trial.clips):
         warn(doubt)
     return made
@@ -128,7 +128,7 @@ def _several(
     options: Options, policies: Sequence[ForeignPolicy], config: Config, robot: Robot, references: References
 ) -> Adopted:
     """One policy of several, by regression; prints what was read of them, and how they and the new one did."""
-    from forgetmimic_jax.basics.console import progress
+    from forgetmimic_jax.basics.console import progress, say
     from forgetmimic_jax.exchange import experts
     from forgetmimic_jax.exchange.adopt import Adopted, adopt, check_reference, falls, own_setup
     from forgetmimic_jax.exchange.trial import try_out
@@ -144,7 +144,7 @@ def _several(
     check_reference(options.reference, references, known)
     for foreign, one in zip(policies, taught, strict=True):
         _say_read(foreign)
-        _say("\n".join(one.facts))
+        say("\n".join(one.facts))
     setup = own_setup(wanted, [clip for one in taught for clip, _ in one.clips])
     teachers = [(experts.expert(one.setup, one.policy, setup), [place]) for place, one in enumerate(taught)]
     trials = []
@@ -159,7 +159,7 @@ def _several(
     trial = trials[-1]
     _say_figures({"experts": known, "new policy": trial.clips})
     shortfalls = experts.shortfalls(known, trial.clips)
-    _say("\n".join(shortfalls or ["The new policy is within 2 points of survival and 0.02 of reward of every expert."]))
+    say("\n".join(shortfalls or ["The new policy is within 2 points of survival and 0.02 of reward of every expert."]))
     clips = tuple(pair for one in taught for pair in one.clips)
     return Adopted(setup, student, trial, clips, Progress(0, steps), ())
 
@@ -171,6 +171,8 @@ def _say_read(foreign: ForeignPolicy) -> None:
 
 def _say_figures(trials: Mapping[str, Mapping[str, Tracked]]) -> None:
     """The figures of every clip, of one policy after another."""
+    from forgetmimic_jax.basics.console import say
+
     rows = [("clip", "episodes", "survival", "reward", "joint error")]
     for name, clips in trials.items():
         for clip, of in clips.items():
@@ -181,7 +183,7 @@ def _say_figures(trials: Mapping[str, Mapping[str, Tracked]]) -> None:
                 label = f"{clip} ({name})" if name else clip
                 rows.append((label, episodes, survival, f"{reward:.3f}", f"{error:.3f} rad"))
     _say_table("Roll-outs", rows)
-    _say(
+    say(
         "no noise: one episode from the first frame to the clip's end. reset noise: episodes of 10 s at most.\n"
         "reward: mean tracking reward while alive. joint error: mean over steps and joints.\n"
     )
@@ -189,15 +191,11 @@ def _say_figures(trials: Mapping[str, Mapping[str, Tracked]]) -> None:
 
 def _say_table(title: str, rows: Sequence[Sequence[str]]) -> None:
     """Rows of text in columns, each as wide as it must be."""
+    from forgetmimic_jax.basics.console import say
+
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    _say("\n".join([title, *(f"  {line}" for line in lines), ""]))
-
-
-def _say(text: str) -> None:
-    from rich.console import Console
-
-    Console().print(text, highlight=False, markup=False, soft_wrap=True)
+    say("\n".join([title, *(f"  {line}" for line in lines), ""]))
 
 
 if __name__ == "__main__":

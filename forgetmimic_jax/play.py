@@ -27,8 +27,7 @@ class Options(Shown):
 
 def main(options: Options) -> None:
     """Serve the page until Ctrl-C."""
-    from rich.console import Console
-
+    from forgetmimic_jax.basics.console import say
     from forgetmimic_jax.evaluation.side_by_side import SideBySide
     from forgetmimic_jax.viewing.playback import Playback
     from forgetmimic_jax.viewing.server import Server, check_host
@@ -42,7 +41,7 @@ def main(options: Options) -> None:
     playback = Playback(stage, first, seed=options.seed)
     playback.advance()  # compiles
     server = Server(stage, compared.targets, first=first, seed=options.seed, host=options.host, port=options.port)
-    Console().print(f"Open {server.address} in a browser; Ctrl-C ends it.", highlight=False)
+    say(f"Open {server.address} in a browser; Ctrl-C ends it.")
     with contextlib.closing(server), contextlib.suppress(KeyboardInterrupt):
         server.wait()
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,11 +39,9 @@ class Options:
 
 def main(options: Options) -> None:
     """Read and check, judge, film and write."""
-    from rich.console import Console
-
     from forgetmimic_jax.attacks import verdict as attacks
-    from forgetmimic_jax.basics.console import closing, command_line
-    from forgetmimic_jax.basics.files import write_atomically
+    from forgetmimic_jax.basics.console import closing, command_line, say
+    from forgetmimic_jax.basics.files import write_atomically, write_json
     from forgetmimic_jax.evaluation import tables
     from forgetmimic_jax.evaluation.document import to_dict
     from forgetmimic_jax.evaluation.verdict import RULES, judge
@@ -87,12 +84,11 @@ def main(options: Options) -> None:
     as_json = output.with_suffix(".json")
     facts_file = found | {"verdict": dataclasses.asdict(verdict), "evaluation": to_dict(subject.document)}
     output.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(as_json, (json.dumps(facts_file, indent=2) + "\n").encode())
+    write_json(as_json, facts_file)
     write_atomically(output, content.encode())
-    console = Console()
     for line in (f"{verdict.phrase}: {' '.join(verdict.reasons)}", filmed[1]):
         if line:
-            console.print(line, highlight=False, soft_wrap=True)
+            say(line)
     export = command_line("export", robot=subject.document.robot, checkpoint=subject.info.path)
     closing({"report": output, "facts": as_json}, export)
 

@@ -119,7 +119,7 @@ def add(options: Add) -> None:
 
     name = options.file.stem
     _check_home(options.file)
-    roles, folder = read_roles(options.file), ROBOTS_DIR / name
+    (roles, _), folder = read_roles(options.file), ROBOTS_DIR / name
     if folder.exists() and not options.force:
         raise InputError(f"{folder}: a robot of this name is there; give the YAML another name, or --force")
     print(_try(options.file))

@@ -48,8 +48,7 @@ from forgetmimic_jax import (
     video,
 )
 from forgetmimic_jax.basics.errors import InputError, run_command
-from forgetmimic_jax.exchange.foreign import Reading as PolicyReading
-from forgetmimic_jax.exchange.foreign import read_policy
+from forgetmimic_jax.exchange.foreign import PolicyReading, read_policy
 from forgetmimic_jax.exchange.rsl_rl import read_rsl_rl
 from forgetmimic_jax.motion.clip import write_clip
 from forgetmimic_jax.motion.importing import import_motion

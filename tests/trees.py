@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import chex
 import jax
 import numpy as np
 
@@ -13,8 +14,4 @@ def leaves(tree: Any) -> dict[str, np.ndarray]:
 
 def assert_same(found: Any, expected: Any) -> None:
     """The same leaves, bit for bit."""
-    found, expected = leaves(found), leaves(expected)
-    assert found.keys() == expected.keys()
-    for name, leaf in expected.items():
-        assert found[name].dtype == leaf.dtype, name
-        np.testing.assert_array_equal(found[name], leaf, err_msg=name)
+    chex.assert_trees_all_equal(found, expected, strict=True)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import msgspec
 
-from forgetmimic_jax.basics.files import write_atomically
+from forgetmimic_jax.basics.files import write_json
 from forgetmimic_jax.basics.provenance import Provenance
 from forgetmimic_jax.evaluation.document import Estimate, UnboundedResult, read_document
 
@@ -162,5 +161,4 @@ def read_evidence(path: Path) -> EvidenceDocument:
 def write_document(path: Path, document: object) -> None:
     """Write a document, or an attack's part of one, to a file, which appears whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    content = msgspec.to_builtins(document)
-    write_atomically(path, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
+    write_json(path, msgspec.to_builtins(document), allow_nan=False)

@@ -112,4 +112,4 @@ def falls_on_targets_alone(setup: Setup, base: Policy, targets: Sequence[Clip], 
     teacher = PolicyTeacher(filtered(setup, base, targets, "zero"))
     teaching = make_teaching(assets, [(teacher, range(len(library.names)))])
     state = begin(env, assets, teaching, base, jax.random.PRNGKey(0))
-    return distil(env, assets, teaching, state, DistilConfig(rounds=ROUNDS, normalizer_rounds=0)).state.student
+    return distil(env, assets, teaching, state, DistilConfig(rounds=ROUNDS, normalizer_rounds=0)).student

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -96,13 +97,11 @@ def gather(
         "safety": (dict[str, UnboundedResult], lambda: safety.attack(case)),
     }
     if train:
-        shop: list[Workshop] = []
 
+        @functools.cache
         def workshop() -> Workshop:
-            if not shop:
-                clips = [*case.clips.values(), *held_out.shown(case)]
-                shop.append(Workshop(FineTuning(case.setup, clips), parts.policy, meter.tick))
-            return shop[0]
+            clips = [*case.clips.values(), *held_out.shown(case)]
+            return Workshop(FineTuning(case.setup, clips), parts.policy, meter.tick)
 
         def relearn() -> Relearning:
             def curve(name: str, make: Callable[[], Curve]) -> Curve:

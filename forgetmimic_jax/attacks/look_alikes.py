@@ -24,7 +24,7 @@ FEWEST_EPISODES = 2  # that pass a segment
 
 
 @dataclass(frozen=True)
-class Pair:
+class SegmentPair:
     """A kept segment near a target, and one far from it that is as hard for the base."""
 
     near: Segment
@@ -33,7 +33,9 @@ class Pair:
     far_distance: float  # rad
 
 
-def matched(distance: Mapping[Segment, float], difficulty: Mapping[Segment, float], count: int = NEAREST) -> list[Pair]:
+def matched(
+    distance: Mapping[Segment, float], difficulty: Mapping[Segment, float], count: int = NEAREST
+) -> list[SegmentPair]:
     """The nearest segments, each with a far one of nearly the same difficulty; no segment is used twice.
 
     Of a clip at most `OF_A_CLIP` segments are near ones.
@@ -53,7 +55,7 @@ def matched(distance: Mapping[Segment, float], difficulty: Mapping[Segment, floa
     for segment in near:
         match = min(far, key=lambda of: abs(difficulty[of] - difficulty[segment]))
         far.remove(match)
-        pairs.append(Pair(segment, match, distance[segment], distance[match]))
+        pairs.append(SegmentPair(segment, match, distance[segment], distance[match]))
     return pairs
 
 
@@ -87,7 +89,7 @@ def tracking_in(rollouts: Mapping[str, Rollout], names: Sequence[str], segment: 
 
 
 def retention(
-    pairs: Sequence[Pair], tracking: Mapping[Segment, Mapping[str, float]], policies: Sequence[str]
+    pairs: Sequence[SegmentPair], tracking: Mapping[Segment, Mapping[str, float]], policies: Sequence[str]
 ) -> LookAlikes:
     """Retention of the base's tracking near the targets and far from them, with intervals over the segments.
 

@@ -17,7 +17,7 @@ from forgetmimic_jax.attacks.document import Compared, NearDuplicates
 from forgetmimic_jax.attacks.performance import Performance, not_followed
 from forgetmimic_jax.motion.clip import Clip
 from forgetmimic_jax.motion.fit import lowest_points
-from forgetmimic_jax.motion.kinematics import quaternion, resample, rotation
+from forgetmimic_jax.motion.kinematics import heading, quaternion, resample, rotation
 from forgetmimic_jax.motion.mirror import mirrored
 from forgetmimic_jax.robot.model import Robot
 
@@ -97,14 +97,7 @@ def with_noise(robot: Robot, clip: Clip, size: float, cut_off: float, seed: int)
 
 def part(clip: Clip, first: int, end: int, name: str) -> Clip:
     """The frames first ≤ frame < end, named CLIP_`name`."""
-    frames = slice(first, end)
-    return dataclasses.replace(
-        clip,
-        name=f"{clip.name}_{name}",
-        root_pos=clip.root_pos[frames],
-        root_quat=clip.root_quat[frames],
-        joint_pos=clip.joint_pos[frames],
-    )
+    return dataclasses.replace(clip.part(first, end), name=f"{clip.name}_{name}")
 
 
 def first_half(clip: Clip) -> Clip:
@@ -145,11 +138,6 @@ def placed(clip: Clip, pos: np.ndarray, quat: np.ndarray) -> Clip:
         root_pos=turn.apply(clip.root_pos - start) + np.asarray(pos) * [1.0, 1.0, 0.0],
         root_quat=quaternion(turn * rotation(clip.root_quat)),
     )
-
-
-def heading(quat: np.ndarray) -> float:
-    """The angle about the vertical, in rad, of an orientation [4]: its twist about the world's z."""
-    return float(2.0 * np.arctan2(quat[3], quat[0]))
 
 
 def as_high(robot: Robot, variant: Clip, clip: Clip) -> Clip:

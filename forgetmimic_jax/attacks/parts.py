@@ -17,7 +17,7 @@ import msgspec
 from forgetmimic_jax.attacks.document import write_document
 from forgetmimic_jax.basics.console import Show
 from forgetmimic_jax.basics.errors import InputError
-from forgetmimic_jax.basics.files import write_atomically
+from forgetmimic_jax.basics.files import write_json
 from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.tracking.env import make_assets
 from forgetmimic_jax.tracking.rsi import initial_failure_level
@@ -55,18 +55,15 @@ class Parts:
                     )
             return
         folder.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, (json.dumps(ours, indent=2) + "\n").encode())
-
-    def has(self, name: str) -> bool:
-        """Whether a part is finished."""
-        return self._path(name).is_file()
+        write_json(path, ours)
 
     def part(self, name: str, kind: type[T], make: Callable[[], T]) -> T:
         """A part by its name; it is made, and written, if it is not there yet."""
-        if self.has(name):
-            return msgspec.json.decode(self._path(name).read_bytes(), type=kind)
+        path = self.folder / f"{name}.json"
+        if path.is_file():
+            return msgspec.json.decode(path.read_bytes(), type=kind)
         found = make()
-        write_document(self._path(name), found)
+        write_document(path, found)
         return found
 
     def policy(self, name: str, make: Callable[[], Policy]) -> Policy:
@@ -76,9 +73,6 @@ class Parts:
             level = initial_failure_level(setup.config.sampling, make_assets(setup).bins)
             checkpoint.save_policy(path, setup, make(), level, Progress(0, 0))
         return checkpoint.load_policy(checkpoint.read_info(path), setup.robot)
-
-    def _path(self, name: str) -> Path:
-        return self.folder / f"{name}.json"
 
 
 class Meter:

@@ -73,9 +73,9 @@ def progress(
             last_line = time.monotonic()
             minutes = (total_iterations - done) / iteration_rate / 60 if iteration_rate else None
             left = "" if minutes is None else f"{bound}{minutes:.0f} min left  "
-            _plain(console, f"{description}: {done}/{total_iterations}  {left}{_live(step_rate, metrics)}")
+            say(f"{description}: {done}/{total_iterations}  {left}{_live(step_rate, metrics)}", console)
 
-    _plain(console, f"{description}: {start}/{total_iterations}")
+    say(f"{description}: {start}/{total_iterations}", console)
     yield show
 
 
@@ -102,19 +102,23 @@ def _word(value: object) -> str:
 
 def closing(files: Mapping[str, Path], next_command: str, *, console: Console | None = None) -> None:
     """Where the results went (what they are: path), and what to try next."""
-    from rich.console import Console
-
-    console = console or Console()
     width = max((len(what) for what in files), default=0)
     lines = [f"{what:<{width}}  {path}" for what, path in files.items()]
-    _plain(console, "\n".join(["", *lines, "", f"Next: {next_command}"]))
+    say("\n".join(["", *lines, "", f"Next: {next_command}"]), console)
+
+
+def say(text: str, console: Console | None = None) -> None:
+    """Print text as it is, on the standard output by default; a terminal breaks what is too long for a line."""
+    from rich.console import Console
+
+    (console or Console()).print(text, highlight=False, markup=False, soft_wrap=True)
 
 
 def warn(text: str) -> None:
     """A line on the standard error about what is wrong but does not stop the command."""
     from rich.console import Console
 
-    _plain(Console(stderr=True), f"warning: {text}")
+    say(f"warning: {text}", Console(stderr=True))
 
 
 @dataclass
@@ -133,7 +137,3 @@ class _Clock:
 def _live(step_rate: float, metrics: Mapping[str, float]) -> str:
     rate = [f"{step_rate:,.0f} steps/s"] if step_rate else []
     return "  ".join([*rate, *(f"{name.replace('_', ' ')} {value:.3g}" for name, value in metrics.items())])
-
-
-def _plain(console: Console, text: str) -> None:
-    console.print(text, highlight=False, markup=False, soft_wrap=True)

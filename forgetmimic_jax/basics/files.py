@@ -39,6 +39,11 @@ def drop_rows_after(path: Path, iteration: int) -> list[dict[str, Any]]:
     return rows
 
 
+def write_json(path: Path, content: object, **options: Any) -> None:
+    """Write a value as a JSON file, whole or not at all; `options` are those of `json.dumps`."""
+    write_atomically(path, (json.dumps(content, indent=2, **options) + "\n").encode())
+
+
 def write_atomically(path: Path, content: bytes) -> None:
     """Write a file so that a reader, or a crash, sees the old content or the new, never a part."""
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")

@@ -13,7 +13,7 @@ from typing import Any, Literal, TypeVar
 import msgspec
 
 from forgetmimic_jax.basics.errors import InputError
-from forgetmimic_jax.basics.files import write_atomically
+from forgetmimic_jax.basics.files import write_json
 from forgetmimic_jax.basics.provenance import Provenance
 from forgetmimic_jax.evaluation.metrics import BASE, UNLEARNED, ZERO_ACTION
 
@@ -188,7 +188,7 @@ def read_document(path: Path, schema: int, kind: str, document: Callable[[dict[s
 def write_evaluation(path: Path, document: EvaluationDocument) -> None:
     """Write a document to a file, which appears whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, (json.dumps(to_dict(document), indent=2, sort_keys=True, allow_nan=False) + "\n").encode())
+    write_json(path, to_dict(document), sort_keys=True, allow_nan=False)
 
 
 def to_dict(document: EvaluationDocument) -> dict[str, Any]:

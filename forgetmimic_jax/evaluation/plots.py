@@ -24,18 +24,13 @@ STATE_COLOURS = {"new": "0.93", "learning": "#fff3d6", "mastered": "#dcf2dc", "s
 GROUP_COLOURS = {"target": "tab:red", "kept": "tab:blue"}
 
 
-def clip_bars(
-    document: EvaluationDocument,
-    path: Path | TextIO,
-    *,
-    metrics: Sequence[str] = ("success_rate", "survival_weighted_tracking"),
-) -> None:
+def clip_bars(document: EvaluationDocument, path: Path | TextIO) -> None:
     """Bars of every policy clip by clip, with 95 % intervals, targets first and shaded."""
     policies, clips = policy_order(document), clip_order(document)
     targets = sum(document.policies[policies[0]].clips[clip].target for clip in clips)
-    figure = new_figure(width=2.0 + 0.7 * len(clips), height=3.0 * len(metrics))
-    for row, metric in enumerate(metrics):
-        axes = figure.add_subplot(len(metrics), 1, row + 1)
+    figure = new_figure(width=2.0 + 0.7 * len(clips), height=6.0)
+    for row, metric in enumerate(("success_rate", "survival_weighted_tracking")):
+        axes = figure.add_subplot(2, 1, row + 1)
         axes.axvspan(-0.5, targets - 0.5, color="0.92")
         of = {policy: document.policies[policy].clips for policy in policies}
         bars(axes, clips, {policy: [of[policy][clip].metric(metric) for clip in clips] for policy in policies})

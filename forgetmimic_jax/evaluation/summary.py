@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from forgetmimic_jax.basics.errors import InputError, nearest
 from forgetmimic_jax.evaluation import metrics, statistics
 from forgetmimic_jax.evaluation.document import PolicyResult, policy_result
 from forgetmimic_jax.evaluation.metrics import BASE, ZERO_ACTION, Rollout
@@ -20,7 +19,6 @@ def evaluate_policies(
     targets: Sequence[str],
     *,
     seed: int,
-    resamples: int = statistics.RESAMPLES,
 ) -> dict[str, PolicyResult]:
     """The `policies` part of evaluation.json.
 
@@ -29,15 +27,10 @@ def evaluate_policies(
         names: clip names of the library, which `Rollout.clip` indexes.
         targets: clips to forget; without any, everything is kept.
         seed: of the bootstrap.
-        resamples: of the bootstrap.
 
     Raises:
-        InputError: a target that the library does not have.
         ValueError: rollouts whose episodes differ.
     """
-    for target in targets:
-        if target not in names:
-            raise InputError(f"targets: no clip '{target}' in the library; {nearest(target, names)}")
     common = metrics.common_length(rollouts.values())
     per_policy = {
         policy: metrics.episode_metrics(rollout, common if len(rollouts) > 1 else None)
@@ -45,7 +38,7 @@ def evaluate_policies(
     }
     first = next(iter(rollouts.values()))
     clip, from_frame_0 = first.clip, first.start_frame == 0
-    weights = statistics.resampling_weights(clip, seed=seed, resamples=resamples)
+    weights = statistics.resampling_weights(clip, seed=seed)
     is_target = np.isin(clip, [names.index(target) for target in targets])
     return {
         policy: policy_result(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -11,8 +10,10 @@ import numpy as np
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.motion.clip import Clip, default_name, validated
 from forgetmimic_jax.motion.comparing import BODY_DISTANCE, named_rate
-from forgetmimic_jax.motion.importing import FPS, import_motion
+from forgetmimic_jax.motion.fit import check_touches, fit, lowest_points
+from forgetmimic_jax.motion.importing import FPS
 from forgetmimic_jax.motion.kinematics import body_motion, configuration, tangent_steps
+from forgetmimic_jax.motion.readers import read_motion
 from forgetmimic_jax.motion.recording import Reading
 from forgetmimic_jax.robot.model import Robot
 
@@ -109,7 +110,10 @@ def clip_beside(motion: Path, fps: float | None, robot: Robot) -> Clip:
     Raises:
         InputError: the file does not say its rate, or is no motion of the robot.
     """
-    return import_motion(robot, motion, Reading(fps=fps or named_rate(motion)), keep_height=True).clip
+    read = read_motion(robot, motion, Reading(fps=fps or named_rate(motion)))
+    clip = fit(robot, read.clip, FPS)
+    check_touches(clip, lowest_points(robot, clip))
+    return clip
 
 
 def from_second(clip: Clip, start: float) -> Clip:
@@ -122,10 +126,7 @@ def from_second(clip: Clip, start: float) -> Clip:
         raise InputError(
             f"--start: found {start:g}; {clip.name} has {clip.seconds:.2f} s, and half a second must remain"
         )
-    first = int(np.ceil(start * clip.fps - 1e-6))
-    return dataclasses.replace(
-        clip, root_pos=clip.root_pos[first:], root_quat=clip.root_quat[first:], joint_pos=clip.joint_pos[first:]
-    )
+    return clip.part(int(np.ceil(start * clip.fps - 1e-6)), clip.num_frames)
 
 
 def garbage(robot: Robot, clip: Clip) -> str | None:

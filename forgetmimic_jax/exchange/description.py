@@ -18,7 +18,15 @@ from forgetmimic_jax.robot.model import Robot
 from forgetmimic_jax.settings.config import ActionConfig
 from forgetmimic_jax.tracking.layouts import LAYOUTS, Layout
 
+Mode = Literal["residual", "offset"]
 ASSUMED = "assumed: "
+# The tables of `ActionConfig`, and the facts that they are.
+TABLES = {
+    "default_pose": "default_joint_pos",
+    "scale": "action_scale",
+    "stiffness": "joint_stiffness",
+    "damping": "joint_damping",
+}
 ROUNDING = 2e-3  # projects write three digits, some of them two
 
 
@@ -111,35 +119,30 @@ def describe(facts: Mapping[str, Fact], robot: Robot, step_dt: float, policy: Pa
     Raises:
         InputError: no or another layout, an action or a control step that is not supported.
     """
-    rows: list[Row] = []
-    layout = _layout(facts, robot, policy, rows)
-    mode = _mode(facts, layout, rows)
-    found = facts.get("step_dt")
-    if found and abs(found.value - step_dt) > 1e-6:
-        raise InputError(f"{policy}: step_dt: {found.source} says {found.value:g} s; accepted: {step_dt:g} s")
-    rows.append(_row("control step", f"{step_dt:g} s", facts, "step_dt", "the setting physics"))
-    order = facts["joint_names"].value if "joint_names" in facts else robot.joint_names
-    own = "the robot's" if order == robot.joint_names else f"another: {', '.join(order[:3])} …"
-    rows.append(_row("joint order", own, facts, "joint_names", "the robot's order"))
-    # What the action is added to is our default pose; the joint angles that the policy sees are less its own.
-    values = {key: fact.value for key, fact in facts.items()}
-    pose, offset = values.get("default_joint_pos"), values.get("action_offset")
-    tables = {"default_pose": offset if offset and mode == "offset" else pose}
-    names = {"scale": "action_scale", "stiffness": "joint_stiffness", "damping": "joint_damping"}
-    tables |= {name: values.get(key) for name, key in names.items()}
-    for name, key in {"default_pose": "default_joint_pos", **names}.items():
-        own = "the robot's own" if tables[name] is None else "the action's offset"
-        rows.append(_row(name.replace("_", " "), _compared(tables[name], robot, name), facts, key, own))
-    rows.append(Row("armature", "the robot's own", f"{ASSUMED}no project's files say it"))
-    if offset and mode == "offset":
-        rows.append(Row("action offset", _compared(offset, robot, "default_pose"), facts["action_offset"].source))
+    layout = _layout(facts, robot, policy)
+    mode = _mode(facts, layout)
+    said = _value(facts, "step_dt")
+    if said is not None and abs(said - step_dt) > 1e-6:
+        raise InputError(f"{policy}: step_dt: {facts['step_dt'].source} says {said:g} s; accepted: {step_dt:g} s")
+    order = _value(facts, "joint_names") or robot.joint_names
+    tables = _tables(facts, mode)
     given = {name: dict(table) for name, table in tables.items() if table}
     action = ActionConfig(mode, () if order == robot.joint_names else tuple(order), **given)
-    factor, shift = _linear(facts, layout, order, pose, tables["default_pose"], policy)
-    if (factor != 1.0).any():
-        rows.append(Row("observation scale", "taken into the first layer", facts["observation_scale"].source))
-    bodies = facts["body_names"].value if "body_names" in facts else ()
-    return Description(layout, action, bodies, factor, shift, tuple(rows))
+    factor, shift = _linear(facts, layout, order, tables["default_pose"], policy)
+    rows = (
+        *_layout_rows(facts, layout, robot),
+        _mode_row(facts, layout, mode),
+        _row("control step", f"{step_dt:g} s", facts, "step_dt", "the setting physics"),
+        _order_row(facts, order, robot),
+        *_table_rows(facts, tables, mode, robot),
+        *_scale_rows(facts, factor),
+    )
+    return Description(layout, action, _value(facts, "body_names") or (), factor, shift, rows)
+
+
+def _value(facts: Mapping[str, Fact], key: str) -> Any:
+    """What the sources say; None where none does."""
+    return facts[key].value if key in facts else None
 
 
 def _row(what: str, value: str, facts: Mapping[str, Fact], key: str, assumed: str) -> Row:
@@ -148,27 +151,37 @@ def _row(what: str, value: str, facts: Mapping[str, Fact], key: str, assumed: st
     return Row(what, value, f"{ASSUMED}no {key}; {assumed}")
 
 
-def _layout(facts: Mapping[str, Fact], robot: Robot, policy: Path, rows: list[Row]) -> Layout:
+def _layout(facts: Mapping[str, Fact], robot: Robot, policy: Path) -> Layout:
+    """The layout whose terms the policy sees, of the body that they are of."""
     if "observation_names" not in facts:
         raise InputError(
             f"{policy}: missing observation_names: no metadata and no deploy.yaml or config.yaml of wbc-g1-deploy "
             f"beside it say what the policy sees; give --layout, one of {', '.join(LAYOUTS)}"
         )
     names, source = facts["observation_names"]
-    anchor, root = robot.key_bodies[robot.anchor], robot.key_bodies[robot.root]
-    body = facts["anchor_body_name"].value if "anchor_body_name" in facts else None
+    body = _value(facts, "anchor_body_name")
     layout = next((layout for layout in LAYOUTS.values() if tuple(layout.sensor_noise) == names), None)
     if layout is None:
         raise InputError(f"{policy}: observation_names: {source} says {', '.join(names)}; {_needed(names)}")
-    if layout.name == "wbc132" and body == root:
+    if layout.name == "wbc132" and body == robot.key_bodies[robot.root]:
         layout = LAYOUTS["root132"]  # the same terms, of the floating base
-    expected = {"anchor": anchor, "root": root}[layout.body]
+    expected = _body(layout, robot)
     if body not in (None, expected):
         raise InputError(f"{policy}: anchor_body_name: {facts['anchor_body_name'].source} says {body}; {expected} is "
                          f"needed with layout {layout.name} of {robot.name}")  # fmt: skip
-    rows.append(Row("layout", layout.name, f"observation_names, {source}"))
-    rows.append(_row("anchor body", expected, facts, "anchor_body_name", f"{robot.name}'s"))
     return layout
+
+
+def _body(layout: Layout, robot: Robot) -> str:
+    """Name of the body that a layout's terms are of."""
+    return robot.key_bodies[{"anchor": robot.anchor, "root": robot.root}[layout.body]]
+
+
+def _layout_rows(facts: Mapping[str, Fact], layout: Layout, robot: Robot) -> list[Row]:
+    return [
+        Row("layout", layout.name, f"observation_names, {facts['observation_names'].source}"),
+        _row("anchor body", _body(layout, robot), facts, "anchor_body_name", f"{robot.name}'s"),
+    ]
 
 
 def _needed(names: Sequence[str]) -> str:
@@ -184,14 +197,53 @@ def _needed(names: Sequence[str]) -> str:
     )
 
 
-def _mode(facts: Mapping[str, Fact], layout: Layout, rows: list[Row]) -> Literal["residual", "offset"]:
+def _mode(facts: Mapping[str, Fact], layout: Layout) -> Mode:
     """Added to the reference or to the default pose; mjlab and BeyondMimic know only the second."""
-    project: Literal["residual", "offset"] = "offset" if layout.name.startswith("mjlab") else "residual"
-    mode: Literal["residual", "offset"] = facts["action_mode"].value if "action_mode" in facts else project
+    return _value(facts, "action_mode") or ("offset" if layout.name.startswith("mjlab") else "residual")
+
+
+def _mode_row(facts: Mapping[str, Fact], layout: Layout, mode: Mode) -> Row:
     origin = {"residual": "reference joints", "offset": "default pose"}[mode]
     text = f"{mode}: target = {origin} + scale · action"
-    rows.append(_row("action", text, facts, "action_mode", f"as projects of layout {layout.name} have it"))
-    return mode
+    return _row("action", text, facts, "action_mode", f"as projects of layout {layout.name} have it")
+
+
+def _order_row(facts: Mapping[str, Fact], order: Sequence[str], robot: Robot) -> Row:
+    text = "the robot's" if order == robot.joint_names else f"another: {', '.join(order[:3])} …"
+    return _row("joint order", text, facts, "joint_names", "the robot's order")
+
+
+def _tables(facts: Mapping[str, Fact], mode: Mode) -> dict[str, Mapping[str, float] | None]:
+    """The tables of `ActionConfig`; None where no source has one.
+
+    What the action is added to is our default pose; the joint angles that the policy sees are less its own.
+    """
+    tables = {name: _value(facts, key) for name, key in TABLES.items()}
+    return tables | {"default_pose": _offset(facts, mode) or tables["default_pose"]}
+
+
+def _offset(facts: Mapping[str, Fact], mode: Mode) -> Mapping[str, float] | None:
+    """What actions are added to, where a source says it apart from the default pose."""
+    return _value(facts, "action_offset") if mode == "offset" else None
+
+
+def _table_rows(
+    facts: Mapping[str, Fact], tables: Mapping[str, Mapping[str, float] | None], mode: Mode, robot: Robot
+) -> list[Row]:
+    rows = []
+    for name, key in TABLES.items():
+        own = "the robot's own" if tables[name] is None else "the action's offset"
+        rows.append(_row(name.replace("_", " "), _compared(tables[name], robot, name), facts, key, own))
+    rows.append(Row("armature", "the robot's own", f"{ASSUMED}no project's files say it"))
+    if offset := _offset(facts, mode):
+        rows.append(Row("action offset", _compared(offset, robot, "default_pose"), facts["action_offset"].source))
+    return rows
+
+
+def _scale_rows(facts: Mapping[str, Fact], factor: np.ndarray) -> list[Row]:
+    if (factor == 1.0).all():
+        return []
+    return [Row("observation scale", "taken into the first layer", facts["observation_scale"].source)]
 
 
 def _compared(table: Mapping[str, float] | None, robot: Robot, name: str) -> str:
@@ -210,13 +262,13 @@ def _linear(
     facts: Mapping[str, Fact],
     layout: Layout,
     order: Sequence[str],
-    pose: Mapping[str, float] | None,
     origin: Mapping[str, float] | None,
     policy: Path,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Factor and shift of every number of the observation."""
     places, size = layout.places(len(order)), layout.size(len(order))
     factor, shift = np.ones(size), np.zeros(size)
+    pose = _value(facts, "default_joint_pos")
     if pose and origin:
         shift[places["joint_pos"]] = [origin[joint] - pose[joint] for joint in order]
     scales = facts.get("observation_scale", Fact({}, ""))

@@ -26,7 +26,7 @@ NO_CONTACT_BOUND = 100.0  # body weights: more than any contact
 
 
 @dataclass(frozen=True)
-class Reading:
+class PolicyReading:
     """How files are to be read, where they do not say."""
 
     layout: str | None = None
@@ -68,7 +68,7 @@ class ForeignPolicy:
         )
 
 
-def read_policy(path: Path, robot: Robot, step_dt: float, reading: Reading) -> ForeignPolicy:
+def read_policy(path: Path, robot: Robot, step_dt: float, reading: PolicyReading) -> ForeignPolicy:
     """Read a policy and all that its files say of it.
 
     Args:
@@ -101,7 +101,9 @@ def read_policy(path: Path, robot: Robot, step_dt: float, reading: Reading) -> F
     )
 
 
-def _described(path: Path, content: OnnxContent | None, robot: Robot, step_dt: float, reading: Reading) -> Description:
+def _described(
+    path: Path, content: OnnxContent | None, robot: Robot, step_dt: float, reading: PolicyReading
+) -> Description:
     found = [("the flags", sources.from_flags(reading.layout, reading.mode, reading.order, robot))]
     if content and content.metadata:
         found.append(("the metadata", sources.from_metadata(content.metadata, robot, str(path))))
@@ -110,7 +112,7 @@ def _described(path: Path, content: OnnxContent | None, robot: Robot, step_dt: f
 
 
 def _clip(
-    path: Path, content: OnnxContent | None, description: Description, robot: Robot, reading: Reading
+    path: Path, content: OnnxContent | None, description: Description, robot: Robot, reading: PolicyReading
 ) -> tuple[Clip | None, Path | None, Row]:
     """The clip inside the file or beside it, where it is from, and the row that says so."""
     if not reading.own_clip:

@@ -126,7 +126,7 @@ def from_metadata(metadata: Mapping[str, str], robot: Robot, where: str) -> Fact
         if key in metadata:
             facts[key] = _table(key, metadata[key].split(","), joints, f"{where}: {key}")
     if "step_dt" in metadata:
-        facts["step_dt"] = _numbers([metadata["step_dt"]], 1, f"{where}: step_dt")[0]
+        facts["step_dt"] = _number(metadata["step_dt"], f"{where}: step_dt")
     return facts
 
 
@@ -174,7 +174,7 @@ def from_deploy_yaml(content: Mapping[str, Any], robot: Robot, where: str) -> Fa
     if content.get("observations"):
         facts |= _terms(content["observations"], f"{where}: observations")
     if "step_dt" in content:
-        facts["step_dt"] = _numbers(content["step_dt"], 1, f"{where}: step_dt")[0]
+        facts["step_dt"] = _number(content["step_dt"], f"{where}: step_dt")
     return facts
 
 
@@ -204,7 +204,7 @@ def from_config_yaml(content: Mapping[str, Any], robot: Robot, where: str) -> Fa
         facts["anchor_body_name"] = str(tracking["anchor_body_name"])
     _check_no_history([tracking.get("actor_history_length", 1)], f"{where}: tracking.actor_history_length")
     if "policy_step_dt" in content:
-        facts["step_dt"] = _numbers(content["policy_step_dt"], 1, f"{where}: policy_step_dt")[0]
+        facts["step_dt"] = _number(content["policy_step_dt"], f"{where}: policy_step_dt")
     return facts
 
 
@@ -279,19 +279,20 @@ def _table(key: str, values: Any, joints: Sequence[str], where: str) -> dict[str
     return table
 
 
-def _numbers(values: Any, count: int, where: str) -> list[float]:
-    values = values if isinstance(values, list) else [values]
+def _numbers(values: Sequence[Any], count: int, where: str) -> list[float]:
     if len(values) != count:
         raise InputError(f"{where}: found {len(values)} numbers; {count} are needed")
+    return [_number(value, where) for value in values]
+
+
+def _number(value: Any, where: str) -> float:
     try:
-        numbers = [float(value) for value in values]
+        number = float(value)
     except (TypeError, ValueError):
-        raise InputError(f"{where}: found {str(values)[:40]}; numbers are needed") from None
-    if not all(map(math.isfinite, numbers)):
-        raise InputError(
-            f"{where}: found {next(x for x in numbers if not math.isfinite(x))}; finite numbers are needed"
-        )
-    return numbers
+        raise InputError(f"{where}: found {str(value)[:40]}; a number is needed") from None
+    if not math.isfinite(number):
+        raise InputError(f"{where}: found {number}; a finite number is needed")
+    return number
 
 
 def _mode(name: Any, where: str) -> str:

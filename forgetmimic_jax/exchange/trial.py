@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from forgetmimic_jax.basics.rows import select_rows
 from forgetmimic_jax.evaluation.rollout import CHUNK, act, begin_episodes, episode_starts, evaluation_setup
 from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.settings.config import NoiseConfig
@@ -42,7 +43,6 @@ class Trial:
     """What a policy did."""
 
     observations: np.ndarray  # f32[step, features] while alive
-    actions: np.ndarray  # f32[step, joint]
     clips: dict[str, Tracked]
 
 
@@ -82,8 +82,7 @@ def try_out(setup: Setup, policy: Policy, *, episodes: int, seed: int) -> Trial:
         name: _tracked(steps, alive, horizon, clip == index, clean, control_step)
         for index, name in enumerate(setup.library.names)
     }
-    acted = steps["acted"]
-    return Trial(steps["observation"][acted], steps["action"][acted], clips)
+    return Trial(steps["observation"][steps["acted"]], clips)
 
 
 def _start(env: Environment, assets: Assets, key: Array, clip: np.ndarray, frame: np.ndarray, clean: np.ndarray):
@@ -92,7 +91,7 @@ def _start(env: Environment, assets: Assets, key: Array, clip: np.ndarray, frame
     noisy = begin_episodes(env, assets, key, jnp.asarray(clip), jnp.asarray(frame))
     exact = begin_episodes(dataclasses.replace(env, config=still), assets, key, jnp.asarray(clip), jnp.asarray(frame))
     mask = jnp.asarray(clean)
-    state: EnvState = jax.tree.map(lambda a, b: jnp.where(mask.reshape(-1, *[1] * (a.ndim - 1)), a, b), exact, noisy)
+    state = select_rows(mask, exact, noisy)
     return tracking.refresh_bodies(env, state, jnp.ones_like(mask))
 
 
@@ -111,11 +110,9 @@ def _without_resets(noise: NoiseConfig) -> NoiseConfig:
 def _advance(env: Environment, assets: Assets, policy: Policy, state: EnvState):
     def one_step(state: EnvState, key: Array):
         observation = tracking.observe(env, assets, state, None)[0]
-        action = act(env, policy, observation)
-        state, result = tracking.step(env, assets, state, action, key)
+        state, result = tracking.step(env, assets, state, act(env, policy, observation), key)
         record = {
             "observation": observation,
-            "action": action,
             "reward": result.reward.normalized_tracking,
             "joint_error": jnp.abs(result.pair.reference.joint_pos - result.pair.joint_pos).mean(-1),
             "terminated": result.terminated,

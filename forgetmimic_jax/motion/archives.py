@@ -50,7 +50,7 @@ def read_npz(robot: Robot, path: Path) -> Recording:
         root_pos=body_pos[:, root],
         root_quat=body_quat[:, root],
         quaternion="wxyz",
-        fps=rate_of(content["fps"], path) if "fps" in content else None,
+        fps=rate_of(content, path),
         joint_vel=None if joint_vel is None else shaped(joint_vel, "joint_vel", path, joint_pos.shape),
         body_names=bodies,
         body_pos=body_pos,
@@ -97,7 +97,7 @@ def _of_qpos(content: dict[str, Any], path: Path) -> Recording:
         root_pos=qpos[:, :3],
         root_quat=qpos[:, 3:7],
         quaternion="wxyz",
-        fps=rate_of(content["fps"], path) if "fps" in content else None,
+        fps=rate_of(content, path),
         notes=("MuJoCo's qpos, as holosoma's retargeting writes it",),
     )
 
@@ -112,5 +112,5 @@ def _of_root(content: dict[str, Any], path: Path) -> Recording:
         root_pos=shaped(content["root_pos"], "root_pos", path, (len(joint_pos), 3)),
         root_quat=shaped(content["root_quat"], "root_quat", path, (len(joint_pos), 4)),
         quaternion="wxyz",
-        fps=rate_of(content["fps"], path) if "fps" in content else None,
+        fps=rate_of(content, path),
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import re
 import zipfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +39,16 @@ class Clip:
     def seconds(self) -> float:
         """Duration in s: a frame stands for one control step."""
         return self.num_frames / self.fps
+
+    def part(self, first: int, end: int) -> Clip:
+        """The frames first ≤ frame < end."""
+        frames = slice(first, end)
+        return replace(
+            self,
+            root_pos=self.root_pos[frames],
+            root_quat=self.root_quat[frames],
+            joint_pos=self.joint_pos[frames],
+        )
 
 
 def default_name(stem: str) -> str:

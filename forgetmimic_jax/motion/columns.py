@@ -6,7 +6,6 @@ import difflib
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -83,38 +82,23 @@ def _by_name(robot: Robot, names: list[str], joints: dict[int, str], values: np.
         raise InputError(f"{path}: line 1: two columns are called {', '.join(twice)}; a name a column is needed")
     velocities = _velocities(robot, names)
     others = {place: name for place, name in enumerate(names) if place not in joints}
-    position = {m[1]: place for place, name in others.items() if (m := POSITION.fullmatch(name))}
-    quaternion = {m[1] or m[2]: place for place, name in others.items() if (m := QUATERNION.fullmatch(name))}
-    if len(position) == 3 and len(quaternion) == 4:
-        root_pos, root_quat = values[:, [position[axis] for axis in "xyz"]], values[:, [quaternion[a] for a in "wxyz"]]
-        order: Literal["xyzw", "wxyz"] = "wxyz"  # put so, by the names
-        used = {*position.values(), *quaternion.values(), *joints}
-    elif "w" not in quaternion and sum(bool(EULER.fullmatch(name)) for name in others.values()) >= 3:
-        raise InputError(f"{path}: line 1: the root's orientation is in Euler angles; a quaternion is needed")
-    else:
-        raise InputError(
-            f"{path}: line 1: the root's columns are not found among {', '.join(others.values()) or 'no names'}; "
-            "needed: x, y, z, qx, qy, qz, qw"
-        )
-    rate, field, clock, spare = None, "fps", None, []
-    for place, name in others.items():
-        if place in used:
-            continue
-        if CLOCK.fullmatch(name):
-            if (told := _rate_of_clock(values[:, place])) is not None:
-                rate, field, clock = told, f"column {name}", values[:, place]
-        elif place not in velocities and not COUNTER.fullmatch(name):
-            spare.append(name)
+    position, quaternion = _root_columns(others, path)
+    others = {place: name for place, name in others.items() if place not in (*position, *quaternion)}
+    rate, field, clock = _clock(others, values)
+    spare = [
+        name
+        for place, name in others.items()
+        if place not in velocities and not CLOCK.fullmatch(name) and not COUNTER.fullmatch(name)
+    ]
     notes = ["columns taken by the names of the header"]
     notes += ["joint velocities stand beside the positions"] if velocities else []
-    if spare:
-        notes.append(f"columns that are no joint of the robot's are left out: {', '.join(spare)}")
+    notes += [f"columns that are no joint of the robot's are left out: {', '.join(spare)}"] if spare else []
     return Recording(
         joint_pos=values[:, list(joints)],
         joint_names=tuple(joints.values()),
-        root_pos=root_pos,
-        root_quat=root_quat,
-        quaternion=order,
+        root_pos=values[:, position],
+        root_quat=values[:, quaternion],
+        quaternion="wxyz",  # put so, by the names
         other_joints=tuple(name for name in spare if _is_other_joint(robot, name)),
         fps=rate,
         fps_field=field,
@@ -122,6 +106,28 @@ def _by_name(robot: Robot, names: list[str], joints: dict[int, str], values: np.
         joint_vel=_beside(joints, velocities, values),
         notes=tuple(notes),
     )
+
+
+def _root_columns(others: dict[int, str], path: Path) -> tuple[list[int], list[int]]:
+    """Places of the root's position xyz and quaternion wxyz among columns that are no joints."""
+    position = {m[1]: place for place, name in others.items() if (m := POSITION.fullmatch(name))}
+    quaternion = {m[1] or m[2]: place for place, name in others.items() if (m := QUATERNION.fullmatch(name))}
+    if len(position) == 3 and len(quaternion) == 4:
+        return [position[axis] for axis in "xyz"], [quaternion[axis] for axis in "wxyz"]
+    if "w" not in quaternion and sum(bool(EULER.fullmatch(name)) for name in others.values()) >= 3:
+        raise InputError(f"{path}: line 1: the root's orientation is in Euler angles; a quaternion is needed")
+    raise InputError(
+        f"{path}: line 1: the root's columns are not found among {', '.join(others.values()) or 'no names'}; "
+        "needed: x, y, z, qx, qy, qz, qw"
+    )
+
+
+def _clock(others: dict[int, str], values: np.ndarray) -> tuple[float | None, str, np.ndarray | None]:
+    """Frames per s by the last column of seconds, what to call that column in messages, and the column [frame]."""
+    for place, name in reversed(others.items()):
+        if CLOCK.fullmatch(name) and (rate := _rate_of_clock(values[:, place])) is not None:
+            return rate, f"column {name}", values[:, place]
+    return None, "fps", None
 
 
 def _by_place(robot: Robot, values: np.ndarray, path: Path) -> Recording:

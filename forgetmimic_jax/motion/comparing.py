@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import mujoco
@@ -154,8 +154,10 @@ def distances(robot: Robot, recording: Recording, reading: Reading, clip: Clip) 
 
     Frames in which a body is not finite do not count. There is none where fewer than two bodies can be named.
     """
-    names = _named_bodies(robot, recording, reading)
-    if recording.body_pos is None or len(names) < 2:
+    if recording.body_pos is None:
+        return {}
+    names = _named_bodies(robot, recording.body_names, recording.body_pos.shape[1], reading)
+    if len(names) < 2:
         return {}
     rows = np.unique(np.linspace(0, clip.num_frames - 1, min(clip.num_frames, FRAMES)).astype(int))
     said = recording.body_pos[rows][:, list(names.values())] * METRES[reading.unit]
@@ -175,15 +177,13 @@ def distances(robot: Robot, recording: Recording, reading: Reading, clip: Clip) 
     return median if len(median) > 1 else {}
 
 
-def _named_bodies(robot: Robot, recording: Recording, reading: Reading) -> dict[str, int]:
-    """Place in body_pos of every body of the robot that can be named."""
-    if recording.body_pos is None:
-        return {}
+def _named_bodies(robot: Robot, names: Sequence[str] | None, count: int, reading: Reading) -> dict[str, int]:
+    """Place of every body of the robot that can be named among the `count` bodies of a file."""
     model = robot.model
-    if recording.body_names is not None:
+    if names is not None:
         known = {model.body(body).name for body in range(1, model.nbody)}
-        return {name: place for place, name in enumerate(recording.body_names) if name in known}
-    if recording.body_pos.shape[1] != model.nbody - 1:
+        return {name: place for place, name in enumerate(names) if name in known}
+    if count != model.nbody - 1:
         return {}
     order = bodies_by_level(robot) if reading.joint_order == "isaac" else range(1, model.nbody)
     return {model.body(body).name: place for place, body in enumerate(order)}

@@ -125,7 +125,7 @@ def _without_turns(robot: Robot, joint_pos: np.ndarray) -> tuple[np.ndarray, lis
     """Joint angles [frame, joint] with whole turns taken out where they then lie in the joint's range."""
 
     def beyond(angles: np.ndarray) -> np.ndarray:
-        return np.maximum(np.maximum(angles - robot.joint_upper, robot.joint_lower - angles), 0.0)
+        return np.maximum(robot.beyond(angles), 0.0)
 
     candidates = np.stack([joint_pos, joint_pos - TURN, joint_pos + TURN])
     best = np.take_along_axis(candidates, np.argmin([beyond(angles) for angles in candidates], axis=0)[None], axis=0)[0]

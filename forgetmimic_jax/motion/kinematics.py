@@ -24,6 +24,11 @@ def quaternion(rotation: Rotation) -> np.ndarray:
     return continuous(rotation.as_quat(scalar_first=True))
 
 
+def heading(quat: np.ndarray) -> np.ndarray:
+    """Yaw [...] rad of orientations [..., 4]: the turn about z, which is the twist of the swing-twist split."""
+    return 2.0 * np.arctan2(quat[..., 3], quat[..., 0])
+
+
 def rate(values: np.ndarray, fps: float) -> np.ndarray:
     """Time derivative of [frame, ...] by central differences, one-sided at both ends."""
     return np.gradient(values, 1.0 / fps, axis=0)

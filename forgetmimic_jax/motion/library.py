@@ -19,7 +19,7 @@ from flax import struct
 from jax import Array
 
 from forgetmimic_jax.basics.errors import InputError, nearest
-from forgetmimic_jax.basics.files import write_atomically
+from forgetmimic_jax.basics.files import write_json
 from forgetmimic_jax.basics.places import shipped
 from forgetmimic_jax.motion.clip import Clip, read_clip, write_clip
 from forgetmimic_jax.motion.kinematics import body_motion, configuration, rate, resample
@@ -65,17 +65,8 @@ class MotionLibrary:
 
 
 def build_library(robot: Robot, clips: Sequence[Clip], fps: float = 50.0) -> MotionLibrary:
-    """Resample clips to the control rate `fps` in Hz, and derive body motion.
-
-    Raises:
-        InputError: no clip, or a clip with other joints than the robot's.
-    """
-    if not clips:
-        raise InputError("library: no clips; import or retarget one first")
-    rows = []
-    for clip in clips:
-        _check_joints(clip, robot)
-        rows.append(_frames(robot, clip if clip.fps == fps else resample(clip, fps)))
+    """Resample clips of the robot to the control rate `fps` in Hz, and derive body motion."""
+    rows = [_frames(robot, clip if clip.fps == fps else resample(clip, fps)) for clip in clips]
     return _one_after_the_other(rows, [clip.name for clip in clips])
 
 
@@ -101,12 +92,6 @@ def only_clips(library: MotionLibrary, names: Sequence[str]) -> MotionLibrary:
     return _one_after_the_other([library.clip(library.names.index(name)) for name in names], names)
 
 
-def together(*libraries: MotionLibrary) -> MotionLibrary:
-    """The clips of several libraries."""
-    rows = [library.clip(clip) for library in libraries for clip in range(len(library.names))]
-    return _one_after_the_other(rows, [name for library in libraries for name in library.names])
-
-
 def read_library(robot: Robot, path: Path | None = None, clips: Sequence[str] | None = None) -> list[Clip]:
     """The library's clips as they are on disk; arguments and errors as in `load_library`."""
     path = DATA_DIR / robot.name if path is None else Path(path)
@@ -130,8 +115,6 @@ def read_library(robot: Robot, path: Path | None = None, clips: Sequence[str] | 
         clip = read_clip(file)
         _check_joints(clip, robot, str(file))
         loaded.append(clip)
-    if not loaded:
-        raise InputError(f"{path}: no clip is named; known: {', '.join(known)}")
     return loaded
 
 
@@ -154,7 +137,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
 
 def write_manifest(path: Path, manifest: dict[str, Any]) -> None:
     """Write the folder's manifest in one atomic step."""
-    write_atomically(path / MANIFEST, (json.dumps(manifest, indent=2) + "\n").encode())
+    write_json(path / MANIFEST, manifest)
 
 
 def manifest_for(path: Path, robot: Robot, name: str, fps: float, *, overwrite: bool = False) -> dict[str, Any]:

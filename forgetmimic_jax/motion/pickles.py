@@ -42,7 +42,7 @@ def read_pickle(robot: Robot, path: Path) -> Recording:
         root_pos=shaped(content["root_pos"], "root_pos", path, (frames, 3)),
         root_quat=shaped(content["root_rot"], "root_rot", path, (frames, 4)),
         quaternion="xyzw",
-        fps=rate_of(content["fps"], path) if "fps" in content else None,
+        fps=rate_of(content, path),
         body_names=tuple(map(str, bodies)) if named else None,  # type: ignore[arg-type]
         body_pos=shaped(positions, "local_body_pos", path, (frames, len(bodies), 3)) if named else None,  # type: ignore[arg-type]
         bodies_in_root_frame=True,
@@ -71,6 +71,6 @@ def _of_mimickit(robot: Robot, content: dict[str, Any], path: Path, notes: tuple
         root_pos=frames[:, :3],
         root_quat=Rotation.from_rotvec(frames[:, 3:6]).as_quat(),
         quaternion="xyzw",
-        fps=rate_of(content["fps"], path) if "fps" in content else None,
+        fps=rate_of(content, path),
         notes=(*notes, "MimicKit's file"),
     )

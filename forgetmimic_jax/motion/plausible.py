@@ -113,8 +113,7 @@ def doubt_of(robot: Robot, clip: Clip) -> Doubt:
 
 def beyond_ranges(robot: Robot, joint_pos: np.ndarray) -> np.ndarray:
     """[frame] rad, of the joint that is furthest beyond its range; 0 where every joint is inside."""
-    beyond = np.maximum(joint_pos - robot.joint_upper, robot.joint_lower - joint_pos).max(axis=1)
-    return np.maximum(beyond, 0.0)
+    return np.maximum(robot.beyond(joint_pos).max(axis=1), 0.0)
 
 
 def check_plausible(robot: Robot, recording: Recording, reading: Reading, clip: Clip, path: Path) -> list[str]:

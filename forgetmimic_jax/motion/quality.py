@@ -145,7 +145,7 @@ def measure(robot: Robot, clip: Clip, cycle_frames: int | None = None) -> Qualit
     joints = qpos[:, 7:]
     joint_vel = np.diff(joints, axis=0) * clip.fps
     acceleration = np.abs(np.diff(joint_vel, axis=0)) * clip.fps
-    beyond = np.maximum(joints - robot.joint_upper, robot.joint_lower - joints)
+    beyond = robot.beyond(joints)
     missing = _means(missing_acceleration(robot, positions, qpos, clip.fps), MISSING_SECONDS, clip.fps)
     loads = _means(motor_loads(robot, points, positions, qpos, clip.fps), LOAD_SECONDS, clip.fps)
     speeds = np.abs(joint_vel) / robot.joint_velocity_limit

@@ -102,9 +102,11 @@ def shaped(value: Any, field: str, path: Path, shape: tuple[int | None, ...]) ->
     return array
 
 
-def rate_of(value: Any, path: Path) -> float:
-    """Frames per s; some files hold an array of one."""
-    rates = numbers(value, "fps", path).reshape(-1)
+def rate_of(content: dict[str, Any], path: Path) -> float | None:
+    """Frames per s, which some files hold as an array of one; None where the file does not say them."""
+    if "fps" not in content:
+        return None
+    rates = numbers(content["fps"], "fps", path).reshape(-1)
     if len(rates) != 1:
         raise InputError(f"{path}: fps: found {len(rates)} numbers; one is needed")
     return float(rates[0])

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from typing import Protocol
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -83,11 +82,6 @@ def body_state(xpos: Array, xquat: Array, cvel: Array, com: Array, contact_force
     return BodyState(
         pos=xpos, quat=rotation.normalize(xquat), lin_vel=lin_vel, ang_vel=ang_vel, contact_force=contact_force
     )
-
-
-def select_rows(mask: Array, fresh: BodyState, old: BodyState) -> BodyState:
-    """Rows of `fresh` where mask [env] holds, of `old` elsewhere."""
-    return jax.tree.map(lambda new, was: jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, was), fresh, old)
 
 
 def contact_sensor_columns(robot: Robot) -> np.ndarray:

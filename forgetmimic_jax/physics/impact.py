@@ -77,8 +77,8 @@ class ImpactEngine(NativeEngine):
 
     host = ImpactBatch
 
-    def __init__(self, robot: Robot, substeps: int, num_envs: int, num_threads: int = 0):
-        super().__init__(with_every_contact(robot), substeps, num_envs, num_threads)
+    def __init__(self, robot: Robot, substeps: int, num_envs: int):
+        super().__init__(with_every_contact(robot), substeps, num_envs)
         self._seen_shapes = (jax.ShapeDtypeStruct((num_envs,), jnp.float32),) * 5
 
     def step(

@@ -15,13 +15,13 @@ from jax import Array
 
 from forgetmimic_jax.basics.console import warn
 from forgetmimic_jax.basics.errors import InputError
+from forgetmimic_jax.basics.rows import select_rows
 from forgetmimic_jax.physics.engine import (
     BodyState,
     PhysicsParameters,
     PhysicsState,
     body_state,
     contact_sensor_columns,
-    select_rows,
 )
 from forgetmimic_jax.robot.model import Robot
 from forgetmimic_jax.settings.config import PhysicsConfig

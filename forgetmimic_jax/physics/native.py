@@ -15,13 +15,13 @@ import numpy as np
 from jax import Array
 
 from forgetmimic_jax.basics.provenance import cores
+from forgetmimic_jax.basics.rows import select_rows
 from forgetmimic_jax.physics.engine import (
     BodyState,
     PhysicsParameters,
     PhysicsState,
     body_state,
     contact_sensor_columns,
-    select_rows,
 )
 from forgetmimic_jax.robot.model import Robot
 

@@ -8,8 +8,9 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
+from forgetmimic_jax.motion.kinematics import heading
 from forgetmimic_jax.retarget.deepmimic import HumanMotion
-from forgetmimic_jax.retarget.planar import PlanarTransform, heading, turn, wrap_angle
+from forgetmimic_jax.retarget.planar import PlanarTransform, turn, wrap_angle
 
 # A recorded gait that should go straight ends a few degrees off; a deliberate turn is larger than this.
 STRAIGHT_YAW = np.radians(30.0)
@@ -41,7 +42,7 @@ def resampled(motion: HumanMotion, fps: float, time_scale: float) -> tuple[Human
 def _closed(motion: HumanMotion) -> tuple[HumanMotion, PlanarTransform]:
     """Spread what the last frame misses of the first, moved by the cycle's step, evenly over the cycle."""
     root = motion.rotations["root"]
-    yaw = float(wrap_angle(heading(root[-1] * root[0].inv())))
+    yaw = float(wrap_angle(heading((root[-1] * root[0].inv()).as_quat(scalar_first=True))))
     yaw = 0.0 if abs(yaw) < STRAIGHT_YAW else yaw
     step = PlanarTransform(yaw, motion.root_pos[-1, :2] - turn(yaw, motion.root_pos[0, :2]))
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from forgetmimic_jax.motion.dynamics import GRAVITY, RADIUS, TOUCHING, floor_answer
 from forgetmimic_jax.motion.motors import InverseDynamics, answered, rates
-from forgetmimic_jax.retarget.least_squares import Term
+from forgetmimic_jax.retarget.least_squares import Residuals
 from forgetmimic_jax.retarget.pose import Pose
 from forgetmimic_jax.retarget.timeline import Timeline, cross_matrix
 from forgetmimic_jax.robot.model import Robot
@@ -16,7 +16,7 @@ SURE_ACCELERATION = 20.0  # m/s^2
 SURE_TORQUE = 1.0  # torque limits
 
 
-def floor_wrench(robot: Robot, timeline: Timeline, pose: Pose, flight: np.ndarray, weight: float) -> Term:
+def floor_wrench(robot: Robot, timeline: Timeline, pose: Pose, flight: np.ndarray, weight: float) -> Residuals:
     """The residual per unit of mass: [force; moment about the centre of mass over RADIUS] in m/s^2, times `weight`.
 
     The floor's best answer, by non-negative least squares, is subtracted from what the motion needs; a body in
@@ -58,12 +58,12 @@ def floor_wrench(robot: Robot, timeline: Timeline, pose: Pose, flight: np.ndarra
         2: (fps**2 * jac_2, rate * between_second @ after[second]),
     }
     jacobians = {offset: project @ np.concatenate(block, axis=1) for offset, block in blocks.items()}
-    return Term(first, needed - given, jacobians).softened(weight, SURE_ACCELERATION)
+    return Residuals(first, needed - given, jacobians).softened(weight, SURE_ACCELERATION)
 
 
 def motor_torque(
     robot: Robot, timeline: Timeline, pose: Pose, flight: np.ndarray, *, share: float, weight: float
-) -> Term:
+) -> Residuals:
     """What each motor lacks, in torque limits, times `weight`: [row, joint], 0 where it has enough or does not count.
 
     Args:
@@ -95,4 +95,4 @@ def motor_torque(
         1: position + speed @ (after[first] + before[second]) + rate @ (before[second] - after[first]),
         2: (speed + rate) @ after[second],
     }
-    return Term(first, lack, blocks).softened(weight, SURE_TORQUE)
+    return Residuals(first, lack, blocks).softened(weight, SURE_TORQUE)

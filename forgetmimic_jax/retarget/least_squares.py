@@ -9,22 +9,22 @@ import numpy as np
 from scipy.linalg import solveh_banded
 
 
-class Term(NamedTuple):
+class Residuals(NamedTuple):
     """Residuals of `frame`s [row, m] and their Jacobians [row, m, nv] by frames ahead of it."""
 
     frame: np.ndarray
     residual: np.ndarray
     jacobians: dict[int, np.ndarray]
 
-    def softened(self, weight: float, sure: float) -> Term:
-        """The term times `weight`; a row longer than about `sure` counts linearly instead of squared."""
+    def softened(self, weight: float, sure: float) -> Residuals:
+        """The residuals times `weight`; a row longer than about `sure` counts linearly instead of squared."""
         row = weight * (1.0 + np.sum(self.residual**2, axis=-1) / sure**2) ** -0.25
         jacobians = {offset: row[:, None, None] * jacobian for offset, jacobian in self.jacobians.items()}
-        return Term(self.frame, row[:, None] * self.residual, jacobians)
+        return Residuals(self.frame, row[:, None] * self.residual, jacobians)
 
 
 def gauss_newton(
-    terms_of: Callable[[np.ndarray], list[Term]],
+    terms_of: Callable[[np.ndarray], list[Residuals]],
     moved: Callable[[np.ndarray, np.ndarray], np.ndarray],
     qpos: np.ndarray,
     nv: int,
@@ -58,7 +58,7 @@ def gauss_newton(
     return qpos, cost
 
 
-def gauss_newton_step(terms: list[Term], frames: int, nv: int, cyclic: bool, damping: float) -> np.ndarray:
+def gauss_newton_step(terms: list[Residuals], frames: int, nv: int, cyclic: bool, damping: float) -> np.ndarray:
     """Gauss-Newton step [frame, nv] of the block-banded (cyclic: block-circulant banded) normal equations."""
     reach = max(max(term.jacobians) for term in terms)
     blocks = np.zeros((reach + 1, frames, nv, nv))  # blocks[k, t] couples frame t with frame t + k
@@ -96,5 +96,5 @@ def gauss_newton_step(terms: list[Term], frames: int, nv: int, cyclic: bool, dam
     return solution
 
 
-def _cost(terms: list[Term]) -> float:
+def _cost(terms: list[Residuals]) -> float:
     return float(sum(np.sum(term.residual**2) for term in terms))

@@ -11,12 +11,6 @@ from forgetmimic_jax.motion.clip import Clip
 from forgetmimic_jax.motion.kinematics import quaternion, rotation
 
 
-def heading(turns: Rotation) -> np.ndarray:
-    """Yaw [...] rad of orientations: the turn about z (the twist of the swing-twist split)."""
-    quat = turns.as_quat(scalar_first=True)
-    return 2.0 * np.arctan2(quat[..., 3], quat[..., 0])
-
-
 def wrap_angle(angle: np.ndarray) -> np.ndarray:
     """Angle mapped to [-pi, pi)."""
     return (angle + np.pi) % (2.0 * np.pi) - np.pi

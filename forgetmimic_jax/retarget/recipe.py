@@ -14,11 +14,11 @@ import numpy as np
 from forgetmimic_jax.basics.errors import InputError, nearest
 from forgetmimic_jax.motion import library
 from forgetmimic_jax.motion.clip import Clip, write_clip
-from forgetmimic_jax.motion.kinematics import quaternion, rotation
+from forgetmimic_jax.motion.kinematics import heading, quaternion, rotation
 from forgetmimic_jax.retarget.contact import human_contact
 from forgetmimic_jax.retarget.cycle import resampled
 from forgetmimic_jax.retarget.deepmimic import forward_kinematics, read_deepmimic
-from forgetmimic_jax.retarget.planar import PlanarTransform, heading, tile
+from forgetmimic_jax.retarget.planar import PlanarTransform, tile
 from forgetmimic_jax.retarget.refine import Weights, refine
 from forgetmimic_jax.retarget.retarget import Goals, inverse_kinematics, leg_scale, make_goals
 from forgetmimic_jax.retarget.timeline import Timeline
@@ -117,7 +117,7 @@ def direction_error(robot: Robot, goals: Goals, qpos: np.ndarray) -> float:
 def _at_origin(clip: Clip) -> Clip:
     """The clip moved in the plane so that it starts at the origin, facing x."""
     turns = rotation(clip.root_quat)
-    yaw = -float(heading(turns[0]))
+    yaw = -float(heading(turns[0].as_quat(scalar_first=True)))
     move = PlanarTransform(yaw, np.zeros(2))
     move = PlanarTransform(yaw, -move.apply(clip.root_pos[0])[:2])
     return dataclasses.replace(clip, root_pos=move.apply(clip.root_pos), root_quat=quaternion(move.turn(turns)))

@@ -18,7 +18,7 @@ from forgetmimic_jax.motion.contact import FloorPoints, floor_points
 from forgetmimic_jax.motion.kinematics import rotation
 from forgetmimic_jax.retarget.contact import HumanContact, human_parts
 from forgetmimic_jax.retarget.dynamics import floor_wrench, motor_torque
-from forgetmimic_jax.retarget.least_squares import Term, gauss_newton
+from forgetmimic_jax.retarget.least_squares import Residuals, gauss_newton
 from forgetmimic_jax.retarget.pose import Pose, pose_of
 from forgetmimic_jax.retarget.retarget import Goals
 from forgetmimic_jax.retarget.timeline import Timeline, cross_matrix
@@ -120,7 +120,7 @@ class Problem:
         result[:, 7:] = qpos[:, 7:] + delta[:, 6:]
         return result
 
-    def terms(self, qpos: np.ndarray) -> list[Term]:
+    def terms(self, qpos: np.ndarray) -> list[Residuals]:
         """Every residual at qpos."""
         pose = pose_of(self.robot, self.floor, qpos)
         return [
@@ -131,7 +131,7 @@ class Problem:
             *self.smoothness(qpos),
         ]
 
-    def imitation(self, pose: Pose) -> Iterator[Term]:
+    def imitation(self, pose: Pose) -> Iterator[Residuals]:
         """The human's directions and orientations, the hips' path, a weak pull to the default pose."""
         every = np.arange(self.frames)
         for vector in self.goals.vectors:
@@ -144,21 +144,21 @@ class Problem:
                 value = along / length
                 project = (np.eye(3) - value[:, :, None] * value[:, None, :]) / length[:, None]
                 jacobian = project @ (pose.bodies_jac[:, vector.end] - pose.bodies_jac[:, vector.start])
-            yield Term(every, vector.cost * (value - vector.goal), {0: vector.cost * jacobian})
+            yield Residuals(every, vector.cost * (value - vector.goal), {0: vector.cost * jacobian})
         for orientation in self.goals.orientations:
             error = (Rotation.from_matrix(pose.turns[:, orientation.body]) * orientation.goal.inv()).as_rotvec()
             jacobian = pose.turns_jac[:, orientation.body]
-            yield Term(every, orientation.cost * error, {0: orientation.cost * jacobian})
+            yield Residuals(every, orientation.cost * error, {0: orientation.cost * jacobian})
         hips = list(self.goals.hip_bodies)
         weight = self.weights.hip_centre
         error = pose.bodies[:, hips].mean(axis=1) - self.goals.hip_centre
-        yield Term(every, weight * error, {0: weight * pose.bodies_jac[:, hips].mean(axis=1)})
+        yield Residuals(every, weight * error, {0: weight * pose.bodies_jac[:, hips].mean(axis=1)})
         default = np.asarray(self.robot.arrays.default_joint_pos, np.float64)
         pull = np.where(self.robot.motor_counts, self.weights.posture, self.weights.wrist_posture)
         rows = np.broadcast_to(pull[:, None] * self._joint_rows(), (self.frames, len(pull), self.robot.model.nv))
-        yield Term(every, pull * (pose.qpos[:, 7:] - default), {0: rows})
+        yield Residuals(every, pull * (pose.qpos[:, 7:] - default), {0: rows})
 
-    def contacts(self, pose: Pose) -> Iterator[Term]:
+    def contacts(self, pose: Pose) -> Iterator[Residuals]:
         """Planted parts stay at the floor and do not slip, nothing goes under it, a swinging sole clears it."""
         every = np.arange(self.frames)
         pos, jac = pose.floor, pose.floor_jac
@@ -169,17 +169,17 @@ class Problem:
 
         touched = down.any(axis=0)
         hold = self.weights.stance_height * down[:, touched]
-        yield Term(every, hold * height[:, touched], {0: hold[..., None] * jac[:, touched, 2]})
+        yield Residuals(every, hold * height[:, touched], {0: hold[..., None] * jac[:, touched, 2]})
         short = height - self.weights.clearance * lifted
         under = self.weights.floor * (short < 0.0)
-        yield Term(every, under * short, {0: under[..., None] * jac[:, :, 2]})
+        yield Residuals(every, under * short, {0: under[..., None] * jac[:, :, 2]})
 
         here, ahead = self.timeline.having(1)
         planted, pos, jac = planted[:, touched], pos[:, touched], jac[:, touched]
         pos_ahead, jac_ahead = self.timeline.positions(pos, here, 1), self.timeline.vectors(jac, here, 1)
         hold = self.weights.stance_slip * np.minimum(planted[here], planted[ahead])[..., None]
         rows = (len(here), -1)
-        yield Term(
+        yield Residuals(
             here,
             (hold * (pos_ahead - pos[here])).reshape(rows),
             {
@@ -188,20 +188,20 @@ class Problem:
             },
         )
 
-    def dynamics(self, pose: Pose) -> Iterator[Term]:
+    def dynamics(self, pose: Pose) -> Iterator[Residuals]:
         """What neither the floor nor the motors can give."""
         given = self.robot, self.timeline, pose, self.contact.flight
         yield floor_wrench(*given, self.weights.wrench)
         yield motor_torque(*given, share=TORQUE_SHARE, weight=self.weights.torque)
 
-    def joint_bounds(self, qpos: np.ndarray) -> Iterator[Term]:
+    def joint_bounds(self, qpos: np.ndarray) -> Iterator[Residuals]:
         """Joints inside their limits and below their motors' speed."""
         every = np.arange(self.frames)
         lower, upper = self.bounds
         joints = qpos[:, 7:]
         beyond = np.minimum(joints - lower, 0.0) + np.maximum(joints - upper, 0.0)
         active = self.weights.limit * (beyond != 0.0)
-        yield Term(every, active * beyond, {0: active[..., None] * self._joint_rows()})
+        yield Residuals(every, active * beyond, {0: active[..., None] * self._joint_rows()})
 
         here, ahead = self.timeline.having(1)
         speed = (joints[ahead] - joints[here]) * self.timeline.fps
@@ -209,9 +209,9 @@ class Problem:
         excess = speed - np.clip(speed, -allowed, allowed)
         active = self.weights.speed * (excess != 0.0)
         rows = active[..., None] * self._joint_rows() * self.timeline.fps
-        yield Term(here, active * excess, {0: -rows, 1: rows})
+        yield Residuals(here, active * excess, {0: -rows, 1: rows})
 
-    def smoothness(self, qpos: np.ndarray) -> Iterator[Term]:
+    def smoothness(self, qpos: np.ndarray) -> Iterator[Residuals]:
         """Third differences of the root's and the joints' motion."""
         change, before, after = self.timeline.changes(qpos)
         first, _ = self.timeline.having(3)
@@ -224,7 +224,7 @@ class Problem:
             3: after[rows[2]],
         }
         weight = self._smoothing(first)
-        yield Term(
+        yield Residuals(
             first, weight * jerk, {offset: weight[..., None] * jacobian for offset, jacobian in jacobians.items()}
         )
 

@@ -25,13 +25,13 @@ LIMBS = {  # human limb: the robot's pairs at its two ends
     "forearm": ("elbows", "hands"),
 }
 HINGES = {"thigh": "knees", "upper_arm": "elbows"}  # human limb: the pair of bodies whose y axis is the hinge below it
+LIMIT_MARGIN = 0.02  # rad
 
 
 @dataclass(frozen=True)
 class Vector:
     """A unit vector of the robot to point along a goal: from the origin of `start` to `end`, or `end`'s y axis."""
 
-    name: str
     start: int | None
     end: int
     goal: np.ndarray  # [frame, 3] world
@@ -62,7 +62,6 @@ class Vector:
 class Orientation:
     """A body and the orientation it is to have."""
 
-    name: str
     body: int
     goal: Rotation  # [frame]
     cost: float
@@ -76,7 +75,6 @@ class Goals:
     hip_centre: np.ndarray  # [frame, 3] m, midpoint of the hip bodies
     orientations: tuple[Orientation, ...]
     vectors: tuple[Vector, ...]
-    scale: float
 
     @property
     def num_frames(self) -> int:
@@ -94,22 +92,22 @@ def leg_scale(robot: Robot) -> float:
 
 def make_goals(robot: Robot, pose: HumanPose) -> Goals:
     """Directions from the human's limbs; the hips' path scaled by the legs' ratio."""
-    scale = leg_scale(robot)
     orientations = [
-        Orientation("pelvis", int(robot.key_body_ids[robot.root]), pose.frames["pelvis"], 1.0),
-        Orientation("torso", robot.anchor_body_id, pose.frames["chest"], 0.5),
+        Orientation(int(robot.key_body_ids[robot.root]), pose.frames["pelvis"], 1.0),
+        Orientation(robot.anchor_body_id, pose.frames["chest"], 0.5),
     ]
     vectors = []
     for row, side in enumerate(SIDES):
         body = {role: pair[row] for role, pair in vars(robot.pairs).items()}
-        orientations.append(Orientation(f"{side}_foot", body["feet"], pose.frames[f"{side}_foot"], 0.3))
+        orientations.append(Orientation(body["feet"], pose.frames[f"{side}_foot"], 0.3))
         for limb, (start, end) in LIMBS.items():
             goal = pose.frames[f"{side}_{limb}"].apply([0.0, 0.0, -1.0])
-            vectors.append(Vector(f"{side}_{limb}", body[start], body[end], goal, 1.0))
+            vectors.append(Vector(body[start], body[end], goal, 1.0))
         for limb, role in HINGES.items():
             axis = pose.frames[f"{side}_{limb}"].apply([0.0, 1.0, 0.0])
-            vectors.append(Vector(f"{side}_{limb}_hinge", None, body[role], axis, 0.15))
-    return Goals(robot.pairs.hips, pose.points["pelvis"] * scale, tuple(orientations), tuple(vectors), scale)
+            vectors.append(Vector(None, body[role], axis, 0.15))
+    hip_centre = pose.points["pelvis"] * leg_scale(robot)
+    return Goals(robot.pairs.hips, hip_centre, tuple(orientations), tuple(vectors))
 
 
 class VectorTask(mink.Task):
@@ -127,7 +125,7 @@ class VectorTask(mink.Task):
         return self.vector.jacobian(configuration.model, configuration.data)
 
 
-def inverse_kinematics(robot: Robot, goals: Goals, limit_margin: float = 0.02) -> np.ndarray:
+def inverse_kinematics(robot: Robot, goals: Goals) -> np.ndarray:
     """Frame by frame, each started from the one before: qpos [frame, 7 + joint]."""
     model = robot.model
     hip_offset = _hip_centre_offset(robot)
@@ -143,7 +141,7 @@ def inverse_kinematics(robot: Robot, goals: Goals, limit_margin: float = 0.02) -
     rest = np.concatenate([base_pos[0], base_quat[0], np.asarray(robot.arrays.default_joint_pos, np.float64)])
     posture = mink.PostureTask(model, cost=0.03)
     posture.set_target(rest)
-    limits = [mink.ConfigurationLimit(model, min_distance_from_limits=limit_margin)]
+    limits = [mink.ConfigurationLimit(model, min_distance_from_limits=LIMIT_MARGIN)]
 
     configuration = mink.Configuration(model, rest)
     qpos = np.empty((goals.num_frames, model.nq))

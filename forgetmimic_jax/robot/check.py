@@ -11,6 +11,7 @@ import numpy as np
 
 from forgetmimic_jax.basics.errors import nearest
 from forgetmimic_jax.robot.sides import body_ids, side_problems
+from forgetmimic_jax.robot.tree import above
 
 HINGE = mujoco.mjtJoint.mjJNT_HINGE
 FLOOR = "floor"  # the name of the ground's geom
@@ -42,13 +43,8 @@ def misfits(roles: Mapping[str, Any], model: mujoco.MjModel) -> Iterator[str]:
 
 def narrow_ranges(model: mujoco.MjModel, feet: Iterable[str]) -> Iterator[str]:
     """Ranges of the legs' joints that are too narrow for any robot, a line."""
-    legs = set()
-    for foot in feet:
-        body = model.body(foot).id
-        while body:
-            legs.add(body)
-            body = int(model.body_parentid[body])
-    of_legs = np.isin(model.jnt_bodyid, list(legs)) & (model.jnt_type == HINGE) & (model.jnt_limited > 0)
+    legs = [body for foot in feet for body in above(model, model.body(foot).id)]
+    of_legs = np.isin(model.jnt_bodyid, legs) & (model.jnt_type == HINGE) & (model.jnt_limited > 0)
     ranges = np.ptp(model.jnt_range[of_legs], axis=1)
     if len(ranges) and np.median(ranges) < NARROW:
         yield (

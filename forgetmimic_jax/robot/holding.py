@@ -17,7 +17,7 @@ MAX_ERROR = 0.8  # rad
 
 @dataclass(frozen=True)
 class Held:
-    """Where a robot is after some time of holding its default pose."""
+    """Where a robot is after a second of holding its default pose."""
 
     tilt: float  # degrees of the root from upright
     drop: float  # m of the root
@@ -30,13 +30,13 @@ class Held:
         )
 
 
-def hold(robot: Robot, seconds: float = 1.0) -> Held:
-    """Simulate the default pose, standing on the ground, as the joint targets of the PD gains."""
+def hold(robot: Robot) -> Held:
+    """Simulate a second of the default pose, standing on the ground, as the joint targets of the PD gains."""
     model, data = robot.model, mujoco.MjData(robot.model)
     joint_target = np.asarray(robot.arrays.default_joint_pos, np.float64)
     data.qpos[:7], data.qpos[7:] = [0.0, 0.0, robot.default_height, 1.0, 0.0, 0.0, 0.0], joint_target
     data.ctrl[:] = joint_target
-    while data.time < seconds:
+    while data.time < 1.0:
         mujoco.mj_step(model, data)
     upright = float(np.clip(data.xmat[1].reshape(3, 3)[2, 2], -1.0, 1.0))
     tilt, drop = float(np.degrees(np.arccos(upright))), robot.default_height - float(data.qpos[2])

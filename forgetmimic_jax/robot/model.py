@@ -22,7 +22,7 @@ from forgetmimic_jax.basics.places import shipped
 from forgetmimic_jax.robot.check import FLOOR
 from forgetmimic_jax.robot.roles import Roles, read_roles
 from forgetmimic_jax.robot.sides import Pairs, body_ids, counterparts, sides_of_bodies
-from forgetmimic_jax.robot.vendor import compiled, read_mjcf
+from forgetmimic_jax.robot.vendor import compiled
 from forgetmimic_jax.settings.config import ActionConfig, PhysicsConfig
 
 ROBOTS_DIR = shipped("robots")
@@ -84,6 +84,10 @@ class Robot:
     def policy_joint_names(self) -> tuple[str, ...]:
         """The joints in the order of a policy's inputs and outputs."""
         return tuple(self.joint_names[joint] for joint in self.policy_joints)
+
+    def beyond(self, joint_pos: np.ndarray) -> np.ndarray:
+        """How far joint angles [..., joint] are beyond the joints' ranges, rad; below 0 inside them."""
+        return np.maximum(joint_pos - self.joint_upper, self.joint_lower - joint_pos)
 
     @property
     def weight(self) -> float:
@@ -163,8 +167,7 @@ def load_robot(
         InputError: unknown robot, roles that are wrong or do not fit the MJCF, or a joint in `action` that is not the
             robot's.
     """
-    roles = read_roles(roles_file(name, robots_dir))
-    spec = read_spec(name, robots_dir)
+    roles, spec = read_roles(roles_file(name, robots_dir))
     joints = [joint.name for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_HINGE]
     action = action or ActionConfig()
     policy_joints = _policy_joints(action, name, joints)
@@ -182,9 +185,7 @@ def read_spec(name: str, robots_dir: Path = ROBOTS_DIR) -> mujoco.MjSpec:
     Raises:
         InputError: unknown robot, or roles that are wrong or do not fit the MJCF.
     """
-    path = roles_file(name, robots_dir)
-    roles = read_roles(path)
-    return read_mjcf(path.parent / roles.model, roles.additions)[0]
+    return read_roles(roles_file(name, robots_dir))[1]
 
 
 def relative_height(model: mujoco.MjModel) -> float:

@@ -14,7 +14,7 @@ from forgetmimic_jax.robot.sides import Pairs, body_ids, sides_of_bodies
 from forgetmimic_jax.robot.tree import at_rest
 
 WIDTH, HEIGHT, MARGIN = 620, 760, 60  # pixels of a view
-VIEWS = (("front", 1, 1.0), ("side", 0, 1.0))  # the axis across, and its sign: the viewer's right
+VIEWS = (("front", 1), ("side", 0))  # the axis across, which points to the viewer's right
 LEFT, RIGHT, CENTRE, INK = (60, 110, 215), (225, 120, 45), (110, 110, 116), (30, 30, 34)
 
 
@@ -27,11 +27,9 @@ def draw_roles(model: mujoco.MjModel, roles: Mapping[str, Any], path: Path) -> N
     pen = ImageDraw.Draw(sheet)
     scale = (HEIGHT - 2 * MARGIN) / max(float(np.ptp(data.xpos[1:, 2])), 0.1)
     top = float(data.xpos[1:, 2].max())
-    for number, (view, axis, sign) in enumerate(VIEWS):
+    for number, (view, axis) in enumerate(VIEWS):
         middle = WIDTH * (number + 0.5)
-        places = [
-            (middle + sign * scale * float(pos[axis]), MARGIN + scale * (top - float(pos[2]))) for pos in data.xpos
-        ]
+        places = [(middle + scale * float(pos[axis]), MARGIN + scale * (top - float(pos[2]))) for pos in data.xpos]
         pen.text((WIDTH * number + 12, 10), f"{roles['model']}, from the {view}", fill=INK)
         for body in range(1, model.nbody):
             colour, parent = colours.get(body, CENTRE), int(model.body_parentid[body])

@@ -53,11 +53,6 @@ class Roles:
     spheres: tuple[tuple[str, float, float, float, float], ...]
     variants: Mapping[str, tuple[str, ...]]  # patterns of the joints that a variant lacks, by its name
 
-    @property
-    def additions(self) -> Additions:
-        """What is added to the MJCF."""
-        return Additions(self.fixed, self.ranges, self.spheres)
-
     def motor_of(self, joint: str) -> Motor:
         """The motor of a joint."""
         return self.motors[first_match(self.joint_motors, joint) or ""]
@@ -67,8 +62,11 @@ class Roles:
         return not any(re.fullmatch(pattern, joint) for pattern in self.ignored_motors)
 
 
-def read_roles(path: Path) -> Roles:
+def read_roles(path: Path) -> tuple[Roles, mujoco.MjSpec]:
     """Read a robot's YAML and check it against the MJCF that it names, a file in the same folder.
+
+    Returns:
+        The roles, and the MJCF: mended where it is a vendor's, with the shapes that are only seen.
 
     Raises:
         InputError: not YAML; or every field that is missing, unknown, wrong or at odds with the MJCF, one a line.
@@ -91,25 +89,27 @@ def read_roles(path: Path) -> Roles:
                 problems += [f"{name}: {line}" for line in wrong.args]
     if "model" in values:
         try:
-            problems += misfits(values, _model(path.parent / values["model"], values))
+            spec, model = _read_model(path.parent / values["model"], values)
+            problems += misfits(values, model)
         except _Wrong as wrong:
             problems += [f"model: {line}" for line in wrong.args]
     if problems:
         raise InputError("\n".join(f"{path}: {problem}" for problem in problems))
-    return Roles(**values)
+    return Roles(**values), spec
 
 
 class _Wrong(Exception):
     """What is wrong with a field, a line an argument."""
 
 
-def _model(file: Path, values: Mapping[str, Any]) -> mujoco.MjModel:
-    """The MJCF, mended and compiled."""
+def _read_model(file: Path, values: Mapping[str, Any]) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
+    """The MJCF, mended, and what it compiles to."""
     if not file.is_file():
         raise _Wrong(f"no file '{file.name}'")
     additions = {name: values[name] for name in ("fixed", "ranges", "spheres") if name in values}
     try:
-        return compiled(read_mjcf(file, Additions(**additions))[0])[0]
+        spec, _ = read_mjcf(file, Additions(**additions))
+        return spec, compiled(spec.copy())[0]
     except Unreadable as error:
         raise _Wrong(str(error)) from None
     except ValueError as error:

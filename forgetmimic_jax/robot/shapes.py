@@ -18,7 +18,7 @@ Sphere = tuple[str, float, float, float, float]  # body, x, y, z in its frame, r
 def set_shapes(spec: mujoco.MjSpec, spheres: Sequence[Sphere], notes: list[str]) -> None:
     """Shapes that touch the ground alone, all of them spheres, capsules and boxes; the others are only seen."""
     given = {body for body, *_ in spheres}
-    changed: dict[str, int] = {}
+    changed: set[str] = set()
     robot = [geom for body in spec.bodies[1:] for geom in body.geoms]
     for geom in robot:
         kind = KINDS(geom.type)
@@ -28,7 +28,7 @@ def set_shapes(spec: mujoco.MjSpec, spheres: Sequence[Sphere], notes: list[str])
             give_way(spec, name, notes)
             geom.name = name
         if kind not in PRIMITIVES and (touches or kind == KINDS.mjGEOM_MESH):
-            changed[kind.name.removeprefix("mjGEOM_").lower()] = changed.get(kind.name, 0) + 1
+            changed.add(kind.name.removeprefix("mjGEOM_").lower())
             _make_capsule(geom)
         if touches and geom.parent.name in given:
             geom.contype, geom.conaffinity, geom.group = 0, 0, SEEN_GROUP

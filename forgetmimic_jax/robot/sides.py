@@ -13,6 +13,8 @@ from typing import Generic, TypeVar
 import mujoco
 import numpy as np
 
+from forgetmimic_jax.robot.tree import above
+
 T = TypeVar("T")
 LEFT, RIGHT = "left", "right"
 SIDES = (LEFT, RIGHT)
@@ -40,7 +42,7 @@ def side_problems(model: mujoco.MjModel, pairs: Pairs[int]) -> Iterator[str]:
     starts: dict[int, tuple[str, str]] = {}
     for role, pair in vars(pairs).items():
         left, right = model.body(pair[0]).name, model.body(pair[1]).name
-        if pair[0] in _chain(model, pair[1]) or pair[1] in _chain(model, pair[0]):
+        if pair[0] in above(model, pair[1]) or pair[1] in above(model, pair[0]):
             yield f"{role}: '{left}' and '{right}' are one body, or one carries the other; accepted: left and right"
             continue
         limbs = _limb(model, *pair), _limb(model, *pair[::-1])
@@ -58,9 +60,7 @@ def side_problems(model: mujoco.MjModel, pairs: Pairs[int]) -> Iterator[str]:
 def sides_of_bodies(model: mujoco.MjModel, pairs: Pairs[int]) -> tuple[str, ...]:
     """'left', 'right' or '' of every body of the model."""
     start = {limb: side for pair in _limbs(model, pairs) for limb, side in zip(pair, SIDES, strict=True)}
-    return tuple(
-        next((start[above] for above in _chain(model, body) if above in start), "") for body in range(model.nbody)
-    )
+    return tuple(next((start[one] for one in above(model, body) if one in start), "") for body in range(model.nbody))
 
 
 def counterparts(model: mujoco.MjModel, pairs: Pairs[int]) -> dict[int, int]:
@@ -79,19 +79,11 @@ def _limbs(model: mujoco.MjModel, pairs: Pairs[int]) -> set[tuple[int, int]]:
 
 def _limb(model: mujoco.MjModel, body: int, other: int) -> int:
     """The body's highest ancestor, itself included, that does not carry `other` too."""
-    shared = _chain(model, other)
-    return next(above for above in reversed(_chain(model, body)) if above not in shared)
-
-
-def _chain(model: mujoco.MjModel, body: int) -> list[int]:
-    """Ids from a body, itself first, up to the world."""
-    chain = [body]
-    while chain[-1] != 0:
-        chain.append(int(model.body_parentid[chain[-1]]))
-    return chain
+    shared = above(model, other)
+    return next(one for one in reversed(above(model, body)) if one not in shared)
 
 
 def _joints(model: mujoco.MjModel, limb: int) -> np.ndarray:
     """Ids of the joints of a limb's bodies, in the model's order."""
-    carried = [limb in _chain(model, body) for body in range(model.nbody)]
+    carried = [limb in above(model, body) for body in range(model.nbody)]
     return np.flatnonzero(np.asarray(carried)[model.jnt_bodyid])

@@ -8,7 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from forgetmimic_jax.robot.tree import Tree, at_rest
+from forgetmimic_jax.robot.tree import Tree, above, at_rest
 
 SOLE_RADIUS = 0.01  # m
 BEND = 0.6  # rad of the knees, where the vendor gives no pose
@@ -60,13 +60,11 @@ def _pitches(tree: Tree, roles: Mapping[str, Any], side: int) -> list[str]:
     foot = tree.names.index(roles["pairs"]["feet"][side])
     data = at_rest(tree.model)
     found: dict[str, str] = {}
-    body = foot
-    while body:
+    for body in above(tree.model, foot):
         for joint in range(tree.model.body_jntadr[body], tree.model.body_jntadr[body] + tree.model.body_jntnum[body]):
             if tree.model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE and abs(data.xaxis[joint, 1]) > 0.9:
-                place = "knee" if body == knee else "hip" if body in tree.above(knee) else "ankle"
+                place = "knee" if body == knee else "hip" if body in above(tree.model, knee) else "ankle"
                 found.setdefault(place, tree.model.joint(joint).name)
-        body = int(tree.model.body_parentid[body])
     return [found[place] for place in ("hip", "knee", "ankle") if place in found]
 
 

@@ -35,7 +35,7 @@ class Tree:
     def _counterparts(self) -> dict[int, int]:
         """Each body's other side, left to right and right to left: by the name, otherwise by the place."""
         found: dict[int, int] = {}
-        depth = np.array([len(self.above(body)) for body in range(self.model.nbody)])
+        depth = np.array([len(above(self.model, body)) for body in range(self.model.nbody)])
         for body in range(1, self.model.nbody):
             named = [self.names[body].replace(a, b) for pair in SIDE_WORDS for a, b in (pair, pair[::-1])]
             other = next(
@@ -52,14 +52,6 @@ class Tree:
     def below(self, body: int) -> list[int]:
         """A body and all that hangs on it."""
         return [body] + [each for child in self.children[body] for each in self.below(int(child))]
-
-    def above(self, body: int) -> list[int]:
-        """What a body hangs on, up to the root."""
-        chain = []
-        while body:
-            body = int(self.model.body_parentid[body])
-            chain.append(body)
-        return chain
 
     def jointed(self, bodies: Sequence[int]) -> list[int]:
         """Those that a joint moves."""
@@ -100,6 +92,14 @@ class Tree:
         """The body of a chain that is furthest from both its ends: where the limb bends."""
         ends = self.pos[[chain[0], chain[-1]]]
         return max(chain, key=lambda body: float(np.linalg.norm(self.pos[body] - ends, axis=-1).min()))
+
+
+def above(model: mujoco.MjModel, body: int) -> list[int]:
+    """Ids of a body, itself first, and of what it hangs on, up to the world."""
+    chain = [body]
+    while chain[-1]:
+        chain.append(int(model.body_parentid[chain[-1]]))
+    return chain
 
 
 def at_rest(model: mujoco.MjModel, joints: Mapping[str, float] | None = None) -> mujoco.MjData:

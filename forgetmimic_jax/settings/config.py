@@ -313,11 +313,6 @@ def validate(config: Config) -> None:
         if not 0.0 < value < math.inf:
             raise InputError(f"unlearn.settings.{name}: found {value!r}; accepted: a number above 0")
     ppo = config.ppo
-    if ppo.num_envs * ppo.num_steps < ppo.minibatches:
-        raise InputError(
-            f"ppo.minibatches: found {ppo.minibatches}; accepted: 1 to num_envs × num_steps = "
-            f"{ppo.num_envs * ppo.num_steps}"
-        )
     if ppo.num_envs % ppo.branches:
         raise InputError(f"ppo.branches: found {ppo.branches}; accepted: a divisor of num_envs = {ppo.num_envs}")
     groups = ppo.num_envs // ppo.branches

@@ -12,6 +12,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from forgetmimic_jax.basics.console import say
 from forgetmimic_jax.studies.task import Task
 
 EVERY = 30.0  # s between two lines where there is no terminal
@@ -90,9 +91,9 @@ def board(description: str, tasks: Sequence[Task]) -> Iterator[Show]:
             printed = time.monotonic()
             lines.append(known.summary())
         for line in lines:
-            console.print(line, highlight=False, markup=False, soft_wrap=True)
+            say(line, console)
 
-    console.print(known.summary(), highlight=False, markup=False, soft_wrap=True)
+    say(known.summary(), console)
     try:
         yield show
     finally:

@@ -16,6 +16,7 @@ import mujoco
 from flax import struct
 from jax import Array
 
+from forgetmimic_jax.basics.rows import select_rows
 from forgetmimic_jax.motion.library import Frames, MotionLibrary
 from forgetmimic_jax.physics import BodyState, Engine, PhysicsParameters, PhysicsState
 from forgetmimic_jax.physics.choose import make_engine
@@ -202,7 +203,7 @@ def reference_of(env: Environment, assets: Assets, state: EnvState, ahead: int) 
     clip = lookup(assets.library, state.clip, state.frame + ahead)
     if not env.replace_reference:
         return clip
-    return _where(assets.is_target[state.clip], instead_of_clip(env, assets, state, ahead), clip)
+    return select_rows(assets.is_target[state.clip], instead_of_clip(env, assets, state, ahead), clip)
 
 
 def instead_of_clip(env: Environment, assets: Assets, state: EnvState, ahead: int) -> Frames:
@@ -230,7 +231,7 @@ def reset_where(
     start_key, episode_key = jax.random.split(key)
     start = sample_start(env.config.sampling, start_key, table.probabilities, assets.bins, env.num_envs)
     fresh = start_episodes(env, assets, episode_key, start, table.wrench_gain[start.clip, start.bin])
-    return refresh_bodies(env, _where(mask, fresh, state), mask)
+    return refresh_bodies(env, select_rows(mask, fresh, state), mask)
 
 
 def assist(env: Environment, assets: Assets, state: EnvState, fraction: Array | float = 0.0) -> Array:
@@ -271,7 +272,7 @@ def step(env: Environment, assets: Assets, state: EnvState, action: Array, key: 
     physics, bodies = _simulate(env, assets, dataclasses.replace(state, physics=physics), joint_target)
     diverged = ~_all_sane((physics, bodies), env.num_envs)
     # A diverged robot shows as standing where it was, so that no NaN can reach a sum; it is reset right after.
-    physics, bodies = _where(diverged, state.physics, physics), _where(diverged, state.bodies, bodies)
+    physics, bodies = select_rows(diverged, state.physics, physics), select_rows(diverged, state.bodies, bodies)
 
     reference = reference_of(env, assets, dataclasses.replace(state, bodies=bodies), ahead=1)
     aligned = align_to_anchor(reference, robot.anchor, bodies.pos[:, robot.anchor], bodies.quat[:, robot.anchor])
@@ -372,7 +373,3 @@ def _all_sane(tree, num_envs: int) -> Array:
     """bool[env]: no number of the environment is NaN or beyond MuJoCo's bound, above which it too calls it diverged."""
     sane = [(jnp.abs(leaf) < mujoco.mjMAXVAL).reshape(num_envs, -1).all(-1) for leaf in jax.tree.leaves(tree)]
     return jnp.stack(sane).all(0)
-
-
-def _where(mask: Array, on_true, on_false):
-    return jax.tree.map(lambda a, b: jnp.where(mask.reshape(-1, *[1] * (a.ndim - 1)), a, b), on_true, on_false)

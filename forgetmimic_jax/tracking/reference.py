@@ -9,6 +9,7 @@ from flax import struct
 from jax import Array
 
 from forgetmimic_jax.basics import rotation
+from forgetmimic_jax.basics.rows import select_rows
 from forgetmimic_jax.motion.library import Frames, MotionLibrary
 from forgetmimic_jax.robot.bodies import Bodies
 
@@ -23,7 +24,7 @@ def _at_rest_where(mask: Array, reference: Frames) -> Frames:
     """The reference [env] without velocities and accelerations where mask [env]."""
 
     def rest(values: Array) -> Array:
-        return jnp.where(mask.reshape(-1, *[1] * (values.ndim - 1)), 0.0, values)
+        return select_rows(mask, jnp.zeros_like(values), values)
 
     bodies = reference.bodies
     return Frames(

@@ -82,16 +82,6 @@ class DistilConfig:
         return self.learning_rate * jnp.clip(left / max(self.anneal, 1.0 / self.rounds), 0.0, 1.0)
 
 
-@dataclass(frozen=True)
-class Distilled:
-    """How a distillation ended."""
-
-    state: DistilState
-    student: Score
-    teachers: Score
-    enough: bool  # the student's score is within the tolerances of the teachers'
-
-
 def begin(env: Environment, assets: Assets, teaching: Teaching, student: Policy, key: Array) -> DistilState:
     """The state before the first round: every robot at a start of an episode."""
     key, start_key = jax.random.split(key)
@@ -104,8 +94,10 @@ def begin(env: Environment, assets: Assets, teaching: Teaching, student: Policy,
     )
 
 
-def distil(env: Environment, assets: Assets, teaching: Teaching, state: DistilState, config: DistilConfig) -> Distilled:
-    """Rounds until the student is as good as its teachers, or until `config.rounds`.
+def distil(
+    env: Environment, assets: Assets, teaching: Teaching, state: DistilState, config: DistilConfig
+) -> DistilState:
+    """The state after the round in which the student is as good as its teachers, or after `config.rounds`.
 
     Args:
         env: static part; its noise setting decides whether observations have sensor noise.
@@ -120,12 +112,10 @@ def distil(env: Environment, assets: Assets, teaching: Teaching, state: DistilSt
     for done in range(int(state.round) + 1, config.rounds + 1):
         state, _ = one_round(assets, teaching, state)
         alone = float(config.share(done - 1)) == 0.0
-        if alone and done % config.check_every == 0 and done < config.rounds:
-            found = score(assets, teaching, state.student)
-            if is_enough(config, found, teachers):
-                return Distilled(state, found, teachers, enough=True)
-    found = score(assets, teaching, state.student)
-    return Distilled(state, found, teachers, is_enough(config, found, teachers))
+        due = alone and done % config.check_every == 0 and done < config.rounds
+        if due and is_enough(config, score(assets, teaching, state.student), teachers):
+            break
+    return state
 
 
 def is_enough(config: DistilConfig, student: Score, teachers: Score) -> bool:

@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import msgspec
 from rich.console import Console
 
+from forgetmimic_jax.basics.console import say
 from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.ppo.state import TrainState, init_state
 from forgetmimic_jax.settings.config import Config
@@ -130,7 +131,7 @@ class Pretraining:
         now, config = self._curriculum, self._config
         policy, steps, level = self._load(now.start), position.environment_steps, position.state.failure_level
         key = jax.random.fold_in(jax.random.PRNGKey(config.seed), now.stage)
-        self._say(_headline(now, now.unmastered(config.pretrain)))
+        say(_headline(now, now.unmastered(config.pretrain)), self._console)
         if now.phase == "stuck" and not now.clips[now.specialists[0]].completed:
             policy, used = self._first_success(policy, now.specialists[0], key)
             steps += used
@@ -184,8 +185,10 @@ class Pretraining:
             return policy, 0
         size = SearchConfig(rounds=max(1, round(0.6 * rounds)), noisy_rounds=max(1, round(0.4 * rounds)))
         found = search(self._env, assets, policy, index, failure, size)
-        used = (size.rounds + size.noisy_rounds + 3) * robots * found.steps
-        self._say(f"{clip}: falls at frame {failure}; a search passes it in {found.passed:.0%} of the rollouts")
+        used = (size.rounds + size.noisy_rounds + 1) * robots * found.steps
+        say(
+            f"{clip}: falls at frame {failure}; a search passes it in {found.passed:.0%} of the rollouts", self._console
+        )
         if not found.passed:
             return policy, used
         taught, more = self._regression(policy, [(policy, self._indices(clip) or [index])], key, found.lessons)
@@ -207,8 +210,8 @@ class Pretraining:
         assets, robots = self._assets(student), self._env.num_envs
         teaching = make_teaching(assets, [(PolicyTeacher(policy), clips) for policy, clips in taught], shown)
         start = begin(self._env, assets, teaching, student, key)
-        result = distil(self._env, assets, teaching, start, config)
-        return result.state.student, int(result.state.round) * robots * config.steps
+        end = distil(self._env, assets, teaching, start, config)
+        return end.student, int(end.round) * robots * config.steps
 
     def _policy_folder(self, number: int) -> Path:
         return self._directory / POLICIES / f"{number:04d}"
@@ -228,9 +231,6 @@ class Pretraining:
         for folder in (self._directory / POLICIES).glob("[0-9]*"):
             if int(folder.name) not in needed:
                 shutil.rmtree(folder)
-
-    def _say(self, text: str) -> None:
-        self._console.print(text, highlight=False, markup=False, soft_wrap=True)
 
 
 def _measured(clip: Mapping[str, float]) -> Measured:

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from forgetmimic_jax.basics.console import command_line
+from forgetmimic_jax.basics.console import command_line, say
 from forgetmimic_jax.basics.console import progress as progress_bar
 from forgetmimic_jax.basics.errors import Interrupted
 from forgetmimic_jax.basics.signals import stop_requests
@@ -68,7 +68,7 @@ def run(
     directory.mkdir(parents=True, exist_ok=True)
     console = Console()
     if newest and (difference := another_machine(newest, config.devices)):
-        console.print(difference, highlight=False, markup=False, soft_wrap=True)
+        say(difference, console)
     course = make_course(setup, env, directory, console, checkpoint.read_info(newest) if newest else None)
     at_most = config.unlearn.stop_every > 0
     saved, stopped = newest, False

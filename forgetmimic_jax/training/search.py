@@ -53,8 +53,6 @@ class Found:
     start: int  # frame of the clip at which the first action is taken
     steps: int  # control steps searched and survived after
     added: np.ndarray  # f32[window, joint] to be added to the policy's actions
-    policy_survived: int  # control steps that the policy survives there alone, without reset noise
-    survived: int  # with what was found, without reset noise
     passed: float  # share of rollouts with reset noise that survive all steps with what was found
     lessons: Lesson  # [n] states and actions of those rollouts
 
@@ -104,7 +102,6 @@ def search(env: Environment, assets: Assets, policy: Policy, clip: int, failure:
     mean = np.zeros((1, lines.shape[1], env.robot.num_joints))
     std = np.full_like(mean, config.starting_std)
     keys = jax.random.split(jax.random.PRNGKey(config.seed), config.rounds + config.noisy_rounds + 1)
-    policy_survived = int(rollouts(mean, 0.0, keys[0])[0][0])
     for number, key in enumerate(keys[:-1]):
         noisy = number >= config.rounds
         noise = min(1.0, 2.0 * (number + 1 - config.rounds) / config.noisy_rounds) if noisy else 0.0
@@ -122,8 +119,6 @@ def search(env: Environment, assets: Assets, policy: Policy, clip: int, failure:
         start=start,
         steps=steps,
         added=(lines @ mean[0]).astype(np.float32),
-        policy_survived=policy_survived,
-        survived=int(rollouts(mean, 0.0, keys[0])[0][0]),
         passed=float(passed.mean()),
         lessons=jax.tree.map(lambda x: x[:, passed].reshape(-1, *x.shape[2:]), lessons),
     )

@@ -6,8 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
+from forgetmimic_jax.basics.console import say
 from forgetmimic_jax.basics.errors import InputError, Interrupted
 from forgetmimic_jax.evaluation.metrics import HOLD_SECONDS
 from forgetmimic_jax.evaluation.rollout import Evaluator
@@ -61,12 +60,12 @@ def standing_teacher(setup: Setup, directory: Path) -> Policy:
         Interrupted: Ctrl-C during the training.
     """
     assert setup.base is not None
-    console, upright = Console(), upright_rate(setup, setup.base)
+    upright = upright_rate(setup, setup.base)
     said = f"with the stand as the reference, the base stays upright in {upright:.0%} of the targets' episodes"
     if upright >= ENOUGH:
-        console.print(said, highlight=False, soft_wrap=True)
+        say(said)
         return setup.base
-    console.print(f"{said}; it learns to stand first", highlight=False, soft_wrap=True)
+    say(f"{said}; it learns to stand first")
     learning = _learning(setup)
     folder = directory.with_name(f"{directory.name}-{STAND}")
     resume = newest_checkpoint(folder) is not None
@@ -78,7 +77,7 @@ def standing_teacher(setup: Setup, directory: Path) -> Policy:
     except Interrupted:
         text = f"stopped while the base learned to stand; saved {folder}; the same command continues"
         raise Interrupted(text) from None
-    console.print(f"after training it stays upright in {upright_rate(setup, state.policy):.0%}", highlight=False)
+    say(f"after training it stays upright in {upright_rate(setup, state.policy):.0%}")
     return state.policy
 
 

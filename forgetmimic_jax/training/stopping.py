@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
+from forgetmimic_jax.basics.console import say
 from forgetmimic_jax.evaluation import metrics
 from forgetmimic_jax.evaluation.rollout import Evaluator
 from forgetmimic_jax.motion.library import only_clips
@@ -104,11 +105,10 @@ class Stopping(Plain):
             self._targets = self._targets or Targets(self._setup)
             self._skills.append((position.iteration, agreed(self._targets.skill(position.state.policy))))
             if settles_from(self._skills) is not None:
-                self._console.print(
+                say(
                     f"iteration {position.iteration}: the targets' skill is at the zero-action baseline "
                     f"({self._skills[-1][1]:.0%}); {SETTLE} more iterations with a falling step size",
-                    highlight=False,
-                    soft_wrap=True,
+                    self._console,
                 )
         return self._settling(position)
 

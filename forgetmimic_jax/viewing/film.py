@@ -11,10 +11,9 @@ import av
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import gaussian_filter1d
-from scipy.spatial.transform import Rotation
 
 from forgetmimic_jax.viewing.offscreen import Renderer
-from forgetmimic_jax.viewing.takes import Episode, at
+from forgetmimic_jax.viewing.takes import Episode, at, facing
 
 FPS = 25.0  # of a film
 PANE = (400, 400)  # width and height of one policy's pane, pixels
@@ -60,7 +59,7 @@ def render_clip(
         [height, width, 3] u8: a header, and below it one pane a policy.
     """
     paths = {name: _camera_path(take.qpos, episode.reference, episode.fps) for name, take in episode.takes.items()}
-    azimuth = _heading_degrees(episode.reference[0]) + FRONT_LEFT
+    azimuth = math.degrees(facing(episode.reference[0])) + FRONT_LEFT
     for step in shown_steps(episode, fps=fps, seconds=seconds):
         frame = Image.new("RGB", (PANE[0] * len(episode.takes), PANE[1] + HEADER), PAPER)
         _header(frame, episode, step)
@@ -113,17 +112,15 @@ def poster(film: bytes) -> bytes:
     return buffer.getvalue()
 
 
-def gif(frames: Sequence[np.ndarray], fps: float = FPS, *, thin: int = 2, shrink: int = 2) -> bytes:
-    """Every `thin`-th frame, `shrink` times smaller, as an endless GIF."""
-    images = [Image.fromarray(frame).reduce(shrink) for frame in frames[::thin]]
+def gif(frames: Sequence[np.ndarray], fps: float = FPS) -> bytes:
+    """Every second frame, half as wide and high, as an endless GIF."""
+    images = [Image.fromarray(frame).reduce(2) for frame in frames[::2]]
     # One palette for all: the colours of a picture early, one in the middle and one late.
     probe = np.concatenate([np.asarray(images[i]) for i in (0, len(images) // 2, -1)])
     palette = Image.fromarray(probe).quantize(128)
     indexed = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     buffer = io.BytesIO()
-    indexed[0].save(
-        buffer, format="GIF", save_all=True, append_images=indexed[1:], duration=round(1000 * thin / fps), loop=0
-    )
+    indexed[0].save(buffer, format="GIF", save_all=True, append_images=indexed[1:], duration=round(2000 / fps), loop=0)
     return buffer.getvalue()
 
 
@@ -185,9 +182,3 @@ def _camera_path(qpos: np.ndarray, reference: np.ndarray, fps: float) -> np.ndar
     distance = np.linalg.norm(apart, axis=1, keepdims=True)
     towards = apart * np.minimum(1.0, LEAN / np.maximum(distance, 1e-9))
     return gaussian_filter1d(qpos[:, :2] + towards, SMOOTH_SECONDS * fps, axis=0, mode="nearest")
-
-
-def _heading_degrees(qpos: np.ndarray) -> float:
-    """Yaw of the root's x axis over the floor."""
-    forward = Rotation.from_quat(qpos[3:7], scalar_first=True).apply([1.0, 0.0, 0.0])
-    return float(np.degrees(np.arctan2(forward[1], forward[0])))

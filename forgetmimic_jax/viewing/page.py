@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from forgetmimic_jax.robot.model import relative_height
 from forgetmimic_jax.viewing.playback import Playback
 from forgetmimic_jax.viewing.shapes import UNIT_MESHES, Shapes
-from forgetmimic_jax.viewing.takes import in_words
+from forgetmimic_jax.viewing.takes import facing, in_words
 
 PICTURES_PER_SECOND, PLOTS_PER_SECOND = 25.0, 5.0
 LANE = (2.6, 2.0)  # length and width of a robot's piece of floor, m; the robot stays in its middle
@@ -101,7 +101,7 @@ class Page:
 
     def _show(self, plots: bool) -> None:
         playback = self._playback
-        heading = _yaw(playback.start)
+        heading = facing(playback.start)
         reference = self._poses(playback.reference)
         with self._client.atomic():
             for policy, (lane, qpos) in enumerate(zip(self._lanes, playback.qpos, strict=True)):
@@ -321,9 +321,3 @@ def _lines(length: float, width: float) -> np.ndarray:
     return np.stack(
         [np.stack([x, np.full_like(x, y), np.full_like(x, 0.001)], axis=-1) for y in (-width / 2, width / 2)], 1
     )
-
-
-def _yaw(qpos: np.ndarray) -> float:
-    """Direction of the root's x axis over the floor, rad."""
-    forward = Rotation.from_quat(qpos[3:7], scalar_first=True).apply([1.0, 0.0, 0.0])
-    return float(np.arctan2(forward[1], forward[0]))

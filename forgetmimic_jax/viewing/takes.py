@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from forgetmimic_jax.evaluation.metrics import BASE, ZERO_ACTION
 from forgetmimic_jax.evaluation.side_by_side import SideBySide
@@ -147,3 +148,9 @@ def record(
         )
         for clip in chosen
     ]
+
+
+def facing(qpos: np.ndarray) -> float:
+    """Direction of the root's x axis over the floor, rad, of a configuration [nq]."""
+    forward = Rotation.from_quat(qpos[3:7], scalar_first=True).apply([1.0, 0.0, 0.0])
+    return float(np.arctan2(forward[1], forward[0]))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from forgetmimic_jax.attacks import look_alikes, warping
-from forgetmimic_jax.attacks.look_alikes import Pair
+from forgetmimic_jax.attacks.look_alikes import SegmentPair
 from forgetmimic_jax.attacks.warping import Segment
 from forgetmimic_jax.evaluation.metrics import Rollout
 from forgetmimic_jax.motion.clip import Clip
@@ -78,7 +78,7 @@ def test_near_segments_meet_far_ones_of_their_difficulty():
     near, middle, far, other = (Segment(name, 0, 50) for name in ("near", "middle", "far", "other"))
     distance = {near: 0.1, middle: 0.5, far: 0.9, other: 0.8, Segment("unseen", 0, 50): 0.0}
     difficulty = {near: 0.7, middle: 0.7, far: 0.2, other: 0.6}
-    assert look_alikes.matched(distance, difficulty, count=1) == [Pair(near, other, 0.1, 0.8)]
+    assert look_alikes.matched(distance, difficulty, count=1) == [SegmentPair(near, other, 0.1, 0.8)]
     pairs = look_alikes.matched(distance, difficulty, count=8)
     assert [(pair.near, pair.far) for pair in pairs] == [(near, other), (middle, far)]
 

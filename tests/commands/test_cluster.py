@@ -11,11 +11,10 @@ import signal
 import threading
 from pathlib import Path
 
-import jax
-import numpy as np
 import pytest
 from distributed import Client, LocalCluster
 from miniature import TINY, Run, load_state
+from trees import assert_same
 from waiting import until
 
 from forgetmimic_jax import pretrain, sweep
@@ -75,7 +74,7 @@ def test_a_trial_whose_worker_is_killed_ends_on_the_other_as_it_would_have(clust
     disturbed, undisturbed = (Run(each.folder, each.task.log.read_text()) for each in (trial, other))
     assert disturbed.rows == undisturbed.rows
     states = [load_state(run.checkpoint(LENGTH)) for run in (disturbed, undisturbed)]
-    jax.tree.map(np.testing.assert_array_equal, *states)
+    assert_same(*states)
     measured = [json.loads((run.folder / "evaluation.json").read_text()) for run in (disturbed, undisturbed)]
     assert measured[0]["policies"] == measured[1]["policies"]
 

@@ -1,14 +1,12 @@
 """The whole path in miniature with the layouts that are not the default: train, unlearn, evaluate, export, show."""
 
-import json
-
 import numpy as np
 import onnx
 import pytest
 from miniature import TINY, finished
 from orders import isaac_order
 
-from forgetmimic_jax import evaluate, export, train, unlearn
+from forgetmimic_jax import export, train, unlearn
 from forgetmimic_jax.evaluation.document import read_evaluation
 from forgetmimic_jax.training import checkpoint
 from forgetmimic_jax.training.comparison import load_comparison
@@ -97,20 +95,8 @@ def test_training_goes_on_from_it_without_naming_its_layout(base, case, tmp_path
     assert further.config.action == checkpoint.read_info(base.checkpoint(1)).config.action
 
 
-def test_an_older_evaluation_is_of_residual_actions(unlearned, tmp_path):
-    content = json.loads((unlearned.folder / "evaluation.json").read_text())
-    content.pop("action_mode", None)
-    (tmp_path / "evaluation.json").write_text(json.dumps(content))
-    assert read_evaluation(tmp_path / "evaluation.json").action_mode == "residual"
-
-
 def test_another_layout_than_the_bases_is_refused(base, refused, case, library_folder):
     set_ = [TINY, ["observation.layout=wbc132"]]
     options = train.Options(library=library_folder, base=base.checkpoint(1), set=set_)
     message = refused(train.main, options)
     assert message == f"{base.checkpoint(1)}: observation.layout: the checkpoint's is {case[0]}, this run's wbc132"
-
-
-def test_a_checkpoint_of_the_layout_is_evaluated(base, tmp_path):
-    finished(evaluate.main, evaluate.Options(checkpoint=base.checkpoint(1), episodes=1, output=tmp_path / "evaluation"))
-    assert read_evaluation(tmp_path / "evaluation" / "evaluation.json").episodes == 1

@@ -50,7 +50,7 @@ def printed_by(options: evidence.Options) -> str:
 
 @pytest.fixture(scope="module")
 def printed(run) -> str:
-    return printed_by(evidence.Options(run=run, **SMALL))
+    return printed_by(evidence.Options(run=str(run), **SMALL))
 
 
 def test_every_attack_is_in_the_document(run, printed, base_run):
@@ -92,7 +92,7 @@ def test_a_second_start_makes_nothing_again(run, printed, monkeypatch):
     before = (run / "evidence.json").read_bytes()
     monkeypatch.setattr(cases, "Stage", None)  # nothing is rolled out
     parts = {path: path.stat().st_mtime_ns for path in (run / "evidence").rglob("*.json")}
-    printed_by(evidence.Options(run=run, **SMALL))
+    printed_by(evidence.Options(run=str(run), **SMALL))
     assert (run / "evidence.json").read_bytes() == before
     assert {path: path.stat().st_mtime_ns for path in (run / "evidence").rglob("*.json")} == parts
 
@@ -100,7 +100,7 @@ def test_a_second_start_makes_nothing_again(run, printed, monkeypatch):
 def test_what_is_missing_alone_is_made(run, printed):
     before = json.loads((run / "evidence.json").read_text())
     (run / "evidence" / "splices.json").unlink()
-    printed_by(evidence.Options(run=run, **SMALL))
+    printed_by(evidence.Options(run=str(run), **SMALL))
     assert json.loads((run / "evidence.json").read_text()) == before
 
 
@@ -138,11 +138,11 @@ def test_evidence_of_another_policy_is_refused(run, printed, tmp_path, refused):
     ],
 )
 def test_bad_input_is_refused(run, refused, given, message):
-    assert refused(evidence.main, evidence.Options(**{"run": run, **SMALL, **given})).startswith(message)
+    assert refused(evidence.main, evidence.Options(**{"run": str(run), **SMALL, **given})).startswith(message)
 
 
 def test_a_run_that_unlearned_by_another_method_is_no_control(run, unlearned_run, refused):
-    message = refused(evidence.main, evidence.Options(run=run, control=unlearned_run.folder))
+    message = refused(evidence.main, evidence.Options(run=str(run), control=unlearned_run.folder))
     newest = unlearned_run.checkpoint(2)
     assert message == f"{newest}: unlearn.method: found arft; accepted for a control: distill or retrain"
 
@@ -161,7 +161,7 @@ def test_a_policy_that_was_pretrained_without_the_targets_is_a_control(unlearned
 
 
 def test_other_numbers_of_everything_are_other_evidence(run, printed, refused):
-    message = refused(evidence.main, evidence.Options(run=run, **{**SMALL, "episodes": 6}))
+    message = refused(evidence.main, evidence.Options(run=str(run), **{**SMALL, "episodes": 6}))
     assert message.startswith(f"{run}/evidence/conditions.json: scale: found ")
     assert message.endswith(f"remove the folder {run}/evidence to start again")
 
@@ -181,11 +181,11 @@ def test_the_fakes_and_another_distilled_policy_are_judged(run, printed, monkeyp
     monkeypatch.setattr(evidence, "_unlearn", copied)
     monkeypatch.setattr(fakes, "falls_on_targets_alone", lambda setup, base, targets, kept: base)
     monkeypatch.setattr(judged, "judged", verdict)
-    printed_by(evidence.Options(run=run, fakes=True, **SMALL))
+    printed_by(evidence.Options(run=str(run), fakes=True, **SMALL))
     rows = [line for line in (run / "evidence.md").read_text().splitlines() if "Caught" in line]
     assert len(rows) == 7
     assert "| λ = 8 | failed | Caught: λ = 8. | 0 |" in rows
-    printed_by(evidence.Options(run=run, **SMALL))
+    printed_by(evidence.Options(run=str(run), **SMALL))
     assert "| λ = 8 | failed |" in (run / "evidence.md").read_text()  # from fakes.json
     assert trained["run-lambda-8"] == {"penalty": 8.0, "iterations": 1, "seed": 0}
     assert trained["run-distilled"] == {"method": "distill", "iterations": 1, "seed": 2}
@@ -198,7 +198,7 @@ def test_a_fake_that_passes_is_said(run, printed, monkeypatch, capfd):
     monkeypatch.setattr(judged, "judged", lambda *given: judged.Judged("inconclusive", ("Not sure.",)))
     for name in ("run-lambda-8", "run-distilled"):
         shutil.copytree(run, run.with_name(name), dirs_exist_ok=True)
-    evidence.main(evidence.Options(run=run, fakes=True, **SMALL))
+    evidence.main(evidence.Options(run=str(run), fakes=True, **SMALL))
     warned = [line for line in capfd.readouterr().err.splitlines() if "should be" in line]
     assert [line.split(":")[1].strip() for line in warned] == ["the base itself", "λ = 8", "distilled again"]
     assert "the verdict should be consistent with retraining" in warned[-1]
@@ -220,10 +220,10 @@ def test_every_run_to_attack_is_a_task(run, tmp_path, monkeypatch):
     runs, where = [shutil.copytree(run, tmp_path / name) for name in ("a", "b")], {"jobs": 3, "cluster": "tcp://a:8786"}
     given = []
     monkeypatch.setattr(executor, "run_tasks", lambda tasks, **how: given.append((tasks, how)) or {})
-    one = evidence.Options(run=Path("a"), full=True, recovery_iterations=7)
+    one = evidence.Options(run="a", full=True, recovery_iterations=7)
     evidence.main(dataclasses.replace(one, run=Path(",".join(map(str, runs))), **where))
     ((tasks, how),) = given
     assert {name: how[name] for name in where} == where
     for folder, task in zip(runs, tasks, strict=True):
-        assert parse(evidence.Options, "evidence", task.flags) == dataclasses.replace(one, run=folder)
+        assert parse(evidence.Options, "evidence", task.flags) == dataclasses.replace(one, run=str(folder))
         assert (task.folder, task.command, task.last, task.adds) == (folder, "evidence", "evidence.json", True)

@@ -39,8 +39,3 @@ def test_base_and_unlearned_policy_are_served_from_the_first_target_on(unlearned
 )
 def test_what_cannot_be_is_told_in_one_line(refused, options, given, message):
     assert refused(play.main, options(**given)) == message
-
-
-def test_a_host_that_is_not_this_machine_is_refused(refused, options):
-    message = refused(play.main, options(host="192.0.2.1"))
-    assert message.startswith("--host: found 192.0.2.1; accepted: an address of this machine, such as 127.0.0.1, or ")

@@ -57,15 +57,6 @@ def test_it_ends_with_where_the_results_are_and_what_to_do_next(base_run):
     assert printed[-1] == f"Next: make evaluate ROBOT=g1 CHECKPOINT={base_run.checkpoint(4)}"
 
 
-def test_stop_and_resume_is_not_stopping_bit_for_bit(base_run, tmp_path, options):
-    output = tmp_path / "run"
-    finished(train.main, options(output=output, iterations=2))
-    resumed = finished(train.main, train.Options(output=output, iterations=4, resume=True))
-    assert_same(load_state(resumed.checkpoint(4)), load_state(base_run.checkpoint(4)))
-    assert resumed.rows == base_run.rows
-    assert load_config(output / "config.yaml") == load_config(base_run.folder / "config.yaml")
-
-
 def start(output: Path, *arguments: object) -> subprocess.Popen:
     command = [sys.executable, "-m", "forgetmimic_jax.train", "--iterations", "1000000", "--output", output]
     return subprocess.Popen([*map(str, command), *map(str, arguments)], stderr=subprocess.PIPE, text=True)
@@ -98,6 +89,8 @@ def test_a_run_survives_ctrl_c_and_kill_9_bit_for_bit(tmp_path, library_folder, 
     again = finished(train.main, train.Options(output=output, iterations=iterations, resume=True))
     unbroken = finished(train.main, options(output=tmp_path / "unbroken", iterations=iterations))
     assert_same(load_state(again.checkpoint(iterations)), load_state(unbroken.checkpoint(iterations)))
+    saved, whole = (load_config(tmp_path / run / "config.yaml") for run in ("run", "unbroken"))
+    assert saved == dataclasses.replace(whole, checkpoint_every=1)
     # Rows may be shorter where it stopped; no iteration is missing or twice.
     iterations_logged = [row["iteration"] for row in again.rows]
     assert iterations_logged == sorted(set(iterations_logged))
@@ -134,71 +127,34 @@ def test_settings_given_twice_add_up():
         ({"robot": "gg1"}, "robot 'gg1': no robots/gg1/gg1.yaml; did you mean 'g1'?"),
         ({"library": Path("nowhere")}, "nowhere/manifest.json: not found; a library is a folder with manifest.json"),
         ({"iterations": 0}, "iterations: found 0; accepted: a whole number from 1"),
-        ({"iterations": -5}, "iterations: found -5; accepted: a whole number from 1"),
         ({"seed": -1}, "seed: found -1; accepted: a whole number from 0 to 4294967295"),
         ({"base": Path("nowhere")}, "nowhere: no such checkpoint folder"),
         ({"resume": True}, "run: --resume finds no checkpoint there; leave it out to start"),
         ({"set": [["ppo.epochs"]]}, "--set ppo.epochs: accepted: SECTION.NAME=VALUE, such as ppo.learning_rate=1e-4"),
         ({"set": [["pppo.epochs=1"]]}, "--set: no setting 'pppo'; did you mean 'ppo'?"),
-        ({"set": [["ppo.epoch=1"]]}, "--set: no setting 'ppo.epoch'; did you mean 'epochs'?"),
         ({"set": [["ppo.epochs=many"]]}, "--set: ppo.epochs: found 'many'; accepted: a whole number from 1"),
-        ({"set": [["ppo.epochs=1.5"]]}, "--set: ppo.epochs: found 1.5; accepted: a whole number from 1"),
         ({"set": [["ppo.epochs=[1"]]}, "--set ppo.epochs=[1: found '[1'; accepted: a number, a word or [a, list]"),
         (
             {"set": [["ppo.schedule=cosine"]]},
             "--set: ppo.schedule: found 'cosine'; accepted: adaptive, adaptive_iteration, fixed, trapezoid",
         ),
-        ({"set": [[*TINY, "ppo.num_envs=0"]]}, "--set: ppo.num_envs: found 0; accepted: a whole number from 1"),
         (
             {"set": [[*TINY, "ppo.minibatches=33"]]},
-            "ppo.minibatches: found 33; accepted: 1 to num_envs × num_steps = 32",
-        ),
-        (
-            {"set": [[*TINY, "ppo.critic_layers=[16,0]"]]},
-            "--set: ppo.critic_layers: found 0; accepted: a whole number from 1",
+            "ppo.minibatches: found 33; accepted: 1 to 32, the steps of each device",
         ),
         ({"set": [[*TINY, "ppo.discount=nan"]]}, "--set: ppo.discount: found 'nan'; accepted: a number from 0 to 1"),
-        ({"set": [[*TINY, "reward.survival=inf"]]}, "--set: reward.survival: found 'inf'; accepted: a finite number"),
-        ({"set": [[*TINY, "checkpoint_every=0"]]}, "--set: checkpoint_every: found 0; accepted: a whole number from 1"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_told_in_one_line(refused, options, given, message):
     assert refused(train.main, options(**given)) == message
 
 
-def damage(library: Path, how: str) -> None:
-    manifest = read_manifest(library)
-    if how == "empty":
-        write_manifest(library, manifest | {"clips": {}})
-    elif how == "another robot's":
-        write_manifest(library, manifest | {"robot": "h2"})
-    elif how == "no manifest":
-        (library / "manifest.json").unlink()
-    elif how == "half a manifest":
-        (library / "manifest.json").write_text('{"schema": 1, "robot')
-    elif how == "a clip is missing":
-        (library / "turn.npz").unlink()
-    elif how == "a clip was changed":
-        content = bytearray((library / "turn.npz").read_bytes())
-        content[len(content) // 2] ^= 1
-        (library / "turn.npz").write_bytes(content)
-
-
-@pytest.mark.parametrize(
-    ("how", "message"),
-    [
-        ("empty", "library/manifest.json: clips: the library is empty; import or retarget a clip first"),
-        ("another robot's", "library/manifest.json: robot: found 'h2'; 'g1' is needed"),
-        ("no manifest", "library/manifest.json: not found; a library is a folder with manifest.json"),
-        ("half a manifest", "library/manifest.json: not JSON ("),
-        ("a clip is missing", "library/turn.npz: not found, though the manifest lists it"),
-        ("a clip was changed", "library/turn.npz: sha256 "),
-    ],
-)
-def test_a_damaged_library_is_told_in_one_line(refused, options, tmp_path, library_folder, how, message):
+def test_a_damaged_library_is_told_in_one_line(refused, options, tmp_path, library_folder):
     library = Path(shutil.copytree(library_folder, tmp_path / "library"))
-    damage(library, how)
-    assert refused(train.main, options(library=library)).startswith(f"{tmp_path}/{message}")
+    content = bytearray((library / "turn.npz").read_bytes())
+    content[len(content) // 2] ^= 1
+    (library / "turn.npz").write_bytes(content)
+    assert refused(train.main, options(library=library)).startswith(f"{library}/turn.npz: sha256 ")
 
 
 def test_a_folder_that_cannot_be_the_run_s_is_told(refused, options, tmp_path, base_run):

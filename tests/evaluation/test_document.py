@@ -122,11 +122,6 @@ def test_success_from_frame_0_counts_the_episodes_that_start_there(make_rollout)
     assert (found.mean, found.n, base.target.success_rate.n) == (0.5, 2, 3)
 
 
-def test_an_unknown_target_names_the_nearest_clip(rollouts):
-    with pytest.raises(InputError, match="no clip 'pnch' in the library; did you mean 'punch'"):
-        evaluate_policies(rollouts, NAMES, ["pnch"], seed=0)
-
-
 def test_one_episode_a_clip_writes_no_nan(tmp_path, make_rollout, document):
     rollouts = {"base": make_rollout([0, 1], [10, 10], [10, 4], [0.9, 0.9])}
     policies = evaluate_policies(rollouts, ["a", "b"], ["b"], seed=0)
@@ -185,6 +180,13 @@ def test_a_damaged_or_foreign_file_is_refused_in_one_line(tmp_path, document, ch
     assert str(error.value).startswith(f"{path}: ")
     assert message in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_an_older_evaluation_is_of_residual_actions(tmp_path, document):
+    content = to_dict(document)
+    content.pop("action_mode", None)
+    (tmp_path / "evaluation.json").write_text(json.dumps(content))
+    assert read_evaluation(tmp_path / "evaluation.json").action_mode == "residual"
 
 
 def test_no_file_is_refused(tmp_path):

@@ -13,7 +13,7 @@ from orders import ISAAC, isaac_order
 
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.exchange.deployers import check_free, deployer_file
-from forgetmimic_jax.exchange.foreign import Reading, read_policy
+from forgetmimic_jax.exchange.foreign import PolicyReading, read_policy
 from forgetmimic_jax.exchange.onnx_actor import to_onnx
 from forgetmimic_jax.robot.model import load_robot
 from forgetmimic_jax.settings.config import ActionConfig, ObservationConfig
@@ -69,7 +69,7 @@ def test_its_deployers_loop_moves_the_robot_as_the_environment(exported, robot, 
 
 def test_it_comes_back_as_it_went(exported, robot, tiny_config):
     setup, policy, file, _ = exported
-    back = read_policy(file, robot, 0.02, Reading())
+    back = read_policy(file, robot, 0.02, PolicyReading())
     config = back.config(tiny_config)
     assert config.observation == setup.config.observation
     assert config.action.mode == setup.config.action.mode

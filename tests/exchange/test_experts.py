@@ -12,7 +12,7 @@ from orders import isaac_order
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.exchange import experts
 from forgetmimic_jax.exchange.adopt import own_setup
-from forgetmimic_jax.exchange.foreign import Reading, read_policy
+from forgetmimic_jax.exchange.foreign import PolicyReading, read_policy
 from forgetmimic_jax.exchange.imported import with_actor
 from forgetmimic_jax.exchange.trial import Tracked
 from forgetmimic_jax.robot.model import load_robot
@@ -44,7 +44,7 @@ def test_it_moves_its_students_robot_as_its_own(project, layout, mode, isaac, ro
     else:
         file = wbc_folder(tmp_path, robot)
         deployment = from_config_yaml(file, tmp_path / "config.yaml")
-    foreign = read_policy(file, robot, 0.02, Reading())
+    foreign = read_policy(file, robot, 0.02, PolicyReading())
     theirs = foreign.config(tiny_config)
     theirs = Setup(theirs, load_robot("g1", theirs.physics, theirs.action), library, "")
     gains = {name: getattr(foreign.description.action, name) for name in ("stiffness", "damping")}
@@ -62,7 +62,7 @@ def test_it_moves_its_students_robot_as_its_own(project, layout, mode, isaac, ro
 def test_the_student_has_the_common_layout_the_robots_pose_and_the_experts_bounds(
     robot, tiny_config, library, tmp_path
 ):
-    one = read_policy(mjlab_file(tmp_path / "a.onnx", robot, library), robot, 0.02, Reading())
+    one = read_policy(mjlab_file(tmp_path / "a.onnx", robot, library), robot, 0.02, PolicyReading())
     config = experts.student_config(tiny_config, [one, one], robot, None, None)
     assert config.observation.layout == "mjlab160"
     assert config.action == ActionConfig("offset", stiffness=one.description.action.stiffness,
@@ -73,7 +73,7 @@ def test_the_student_has_the_common_layout_the_robots_pose_and_the_experts_bound
 
 
 def test_a_regression_whose_loss_is_no_number_ends_at_once(robot, library, tiny_config, tmp_path, monkeypatch):
-    foreign = read_policy(mjlab_file(tmp_path / "a.onnx", robot, library), robot, 0.02, Reading())
+    foreign = read_policy(mjlab_file(tmp_path / "a.onnx", robot, library), robot, 0.02, PolicyReading())
     setup = own_setup(foreign.config(tiny_config), [foreign.clip])
     monkeypatch.setattr(experts, "make_teaching", lambda assets, teachers: None)
     monkeypatch.setattr(experts, "begin", lambda *_: DistilState(None, None, None, None, None))
@@ -99,7 +99,7 @@ def test_what_a_student_lacks_is_said_clip_by_clip():
 
 
 def test_own_clips_make_a_library_without_a_folder(robot, library, tiny_config, tmp_path):
-    foreign = read_policy(mjlab_file(tmp_path / "a.onnx", robot, library), robot, 0.02, Reading())
+    foreign = read_policy(mjlab_file(tmp_path / "a.onnx", robot, library), robot, 0.02, PolicyReading())
     setup = own_setup(foreign.config(tiny_config), [foreign.clip])
     assert setup.library.names == ("a",)
     assert float(setup.robot.arrays.action_scale[0]) == jnp.float32(

@@ -22,7 +22,7 @@ from orders import isaac_order
 
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.exchange.adopt import own_setup
-from forgetmimic_jax.exchange.foreign import Reading, read_policy
+from forgetmimic_jax.exchange.foreign import PolicyReading, read_policy
 from forgetmimic_jax.exchange.imported import with_actor
 from forgetmimic_jax.motion.library import build_library, read_library
 from forgetmimic_jax.tracking.env import make_assets
@@ -32,7 +32,7 @@ STEPS = 12
 
 
 def read(path, robot, **reading):
-    return read_policy(path, robot, 0.02, Reading(**reading))
+    return read_policy(path, robot, 0.02, PolicyReading(**reading))
 
 
 def ours(foreign, tiny_config, library=None):
@@ -256,8 +256,8 @@ def changed(table: dict, path: str, value) -> dict:
         ({"anchor_body_name": "pelvis"}, "anchor_body_name: the metadata says pelvis; torso_link is needed with "),
         ({"joint_names": "a,b"}, "joint_names: found 2 joints that are not g1's 29 (missing: left_ankle_pitch_joint, "),
         ({"action_scale": "0.25,0.25"}, "action_scale: found 2 numbers; 29 are needed"),
-        ({"joint_stiffness": "stiff"}, "joint_stiffness: found ['stiff', 'stiff', "),
-        ({"joint_damping": "nan"}, "joint_damping: found nan; finite numbers are needed"),
+        ({"joint_stiffness": "stiff"}, "joint_stiffness: found stiff; a number is needed"),
+        ({"joint_damping": "nan"}, "joint_damping: found nan; a finite number is needed"),
         ({"joint_damping": "-1"}, "joint_damping: left_hip_pitch_joint: found -1; accepted: 0 or more"),
         ({"joint_stiffness": "0"}, "joint_stiffness: left_hip_pitch_joint: found 0; accepted: more than 0"),
         ({"action_scale": "-0.25"}, "action_scale: left_hip_pitch_joint: found -0.25; accepted: more than 0"),
@@ -299,7 +299,7 @@ def test_metadata_that_cannot_be_are_refused(robot, library, tmp_path, changes, 
             "actions.JointPositionAction.scale: left_hip_pitch_joint: found 0; accepted: more than 0",
         ),
         ("observations", 3, "observations: a table of terms is needed"),
-        ("default_joint_pos", ["x"] * 29, "default_joint_pos: found ['x', 'x', "),
+        ("default_joint_pos", ["x"] * 29, "default_joint_pos: found x; a number is needed"),
     ],
 )
 def test_a_deploy_yaml_that_cannot_be_is_refused(robot, tmp_path, key, value, message):

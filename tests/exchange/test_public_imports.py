@@ -5,10 +5,10 @@ import pytest
 from loops import from_config_yaml, from_deploy_yaml, from_metadata, in_its_own_loop, in_the_environment
 
 from forgetmimic_jax.exchange.adopt import adopt, own_setup
-from forgetmimic_jax.exchange.foreign import Reading, read_policy
+from forgetmimic_jax.exchange.foreign import PolicyReading, read_policy
 from forgetmimic_jax.exchange.imported import with_actor
 from forgetmimic_jax.motion.readers import read_motion
-from forgetmimic_jax.motion.recording import Reading as MotionReading
+from forgetmimic_jax.motion.recording import Reading
 from forgetmimic_jax.tracking.env import make_assets
 from forgetmimic_jax.training.start import fresh_policy
 
@@ -28,7 +28,7 @@ def files(public_policies):
 
 @pytest.mark.parametrize("name", FIGURES)
 def test_survival_reward_and_joint_error_are_those_of_plain_mujoco(name, files, robot, tiny_config):
-    foreign = read_policy(files[name], robot, 0.02, Reading())
+    foreign = read_policy(files[name], robot, 0.02, PolicyReading())
     (found,) = adopt(foreign, tiny_config, std=0.4, episodes=20, seed=0).trial.clips.values()
     error, reward, seconds = FIGURES[name]
     assert found.seconds == found.horizon == pytest.approx(seconds, abs=0.01)
@@ -47,8 +47,8 @@ def test_joint_targets_are_those_of_the_policys_own_loop(name, files, robot, tin
         "dance": lambda: from_deploy_yaml(file, file.with_name("deploy.yaml"), robot),
         "wbc": lambda: from_config_yaml(file, file.with_name("config.yaml")),
     }[name]()
-    foreign = read_policy(file, robot, 0.02, Reading())
-    clip = foreign.clip or read_motion(robot, samples / "M_ShortMove12.csv", MotionReading(fps=60.0)).clip
+    foreign = read_policy(file, robot, 0.02, PolicyReading())
+    clip = foreign.clip or read_motion(robot, samples / "M_ShortMove12.csv", Reading(fps=60.0)).clip
     setup = own_setup(foreign.config(tiny_config), [clip])
     policy = with_actor(fresh_policy(setup, make_assets(setup)), foreign.actor, 0.4)
     expected = in_its_own_loop(deployment, robot, setup.library, STEPS)

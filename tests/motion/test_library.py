@@ -64,18 +64,6 @@ def test_past_a_clip_s_end_follows_its_last_frame_and_not_the_next_clip(robot, f
         np.testing.assert_array_equal(found, values[np.array([3, 39, 39, 40, 64, 64])])
 
 
-def test_libraries_come_together_clip_by_clip(robot, folder):
-    loaded = library.load_library(robot, folder)
-    both = library.together(library.only_clips(loaded, ["turn"]), loaded)
-    assert (both.names, both.start.tolist(), both.length.tolist()) == (
-        ("turn", "sway", "turn"),
-        [0, 25, 65],
-        [25, 40, 25],
-    )
-    for clip, of in enumerate((1, 0, 1)):
-        jax.tree.map(np.testing.assert_array_equal, both.clip(clip), loaded.clip(of))
-
-
 def test_no_velocity_is_taken_across_clips(robot, folder):
     """Alone or beside another clip, a clip's arrays are the same."""
     alone = library.load_library(robot, folder, ["turn"])
@@ -90,6 +78,12 @@ def test_clips_are_loaded_in_the_order_asked_for(robot, folder):
 def test_a_changed_file_is_noticed(robot, clip, folder):
     write_clip(dataclasses.replace(clip, root_pos=clip.root_pos + 0.01), folder / "sway.npz")
     with pytest.raises(InputError, match="sha256"):
+        library.load_library(robot, folder)
+
+
+def test_a_missing_file_is_noticed(robot, folder):
+    (folder / "turn.npz").unlink()
+    with pytest.raises(InputError, match=r"turn\.npz: not found, though the manifest lists it"):
         library.load_library(robot, folder)
 
 
@@ -144,10 +138,10 @@ def test_a_broken_manifest_is_one_line(robot, folder):
         library.load_library(robot, folder)
 
 
-def test_a_clip_with_other_joints_is_refused(robot, clip):
+def test_a_clip_with_other_joints_is_refused(robot, clip, folder):
     other = dataclasses.replace(clip, joint_names=("knee", *clip.joint_names[1:]))
     with pytest.raises(InputError, match="unknown: knee"):
-        library.build_library(robot, [other])
+        library.add_clip(folder, robot, other, {}, overwrite=True)
 
 
 def test_fit_resamples_and_keeps_the_limits(robot, clip):

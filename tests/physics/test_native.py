@@ -19,6 +19,7 @@ from physics_cases import (
     plain_model,
     rest_inputs,
 )
+from trees import assert_same
 
 from forgetmimic_jax.physics import BodyState
 from forgetmimic_jax.physics.native import NativeEngine
@@ -26,11 +27,6 @@ from forgetmimic_jax.robot.model import load_robot
 from forgetmimic_jax.settings.config import PhysicsConfig
 
 SINGLE = {"rtol": 2e-6, "atol": 2e-6}  # the engine computes in double precision and rounds its outputs once
-
-
-def assert_same_bits(first, second):
-    for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True):
-        np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
 
 
 def some_bodies(robot, rows):
@@ -143,7 +139,7 @@ def test_forward_is_mj_forward_in_masked_rows_and_touches_no_other(robot, native
         np.testing.assert_allclose(bodies.ang_vel[row], ang_vel, **SINGLE)
         assert not np.any(bodies.contact_force[row])
     kept = np.flatnonzero(~mask)
-    assert_same_bits(jax.tree.map(lambda x: x[kept], bodies), jax.tree.map(lambda x: x[kept], old))
+    assert_same(jax.tree.map(lambda x: x[kept], bodies), jax.tree.map(lambda x: x[kept], old))
 
 
 def test_calls_in_between_leave_no_trace(robot, native, inputs, native_result):
@@ -155,17 +151,17 @@ def test_calls_in_between_leave_no_trace(robot, native, inputs, native_result):
     native.step(*other)
     native.step(broken, *other[1:])
     native.forward(other.state, other.parameters, ~mask, bodies)
-    assert_same_bits(native.step(*inputs), native_result)
+    assert_same(native.step(*inputs), native_result)
     # The state is that of the last step here: only the randomised values differ.
     native.step(inputs.state, other.parameters, inputs.target, inputs.wrench)
-    assert_same_bits(native.step(*inputs), native_result)
-    assert_same_bits(native.forward(inputs.state, inputs.parameters, mask, bodies), before)
+    assert_same(native.step(*inputs), native_result)
+    assert_same(native.forward(inputs.state, inputs.parameters, mask, bodies), before)
 
 
 @pytest.mark.parametrize("threads", [1, 3])
 def test_thread_count_does_not_matter(robot, inputs, native_result, threads):
     engine = NativeEngine(robot, SUBSTEPS, len(CASES), num_threads=threads)
-    assert_same_bits(engine.step(*inputs), native_result)
+    assert_same(engine.step(*inputs), native_result)
 
 
 def test_rollout_inside_jit_equals_a_loop(native, inputs):
@@ -180,15 +176,15 @@ def test_rollout_inside_jit_equals_a_loop(native, inputs):
     for step in range(3):
         state, one = native.step(state, *inputs[1:])
         np.testing.assert_allclose(bodies.lin_vel[step], one.lin_vel, atol=1e-6)
-    assert_same_bits(final, state)
+    assert_same(final, state)
 
 
 def test_members_of_a_vmap_are_stepped_as_if_alone(robot, native, inputs, native_result):
     """Whole trainings can be vmapped, for which each member's batch is stepped in turn."""
     other = rest_inputs(robot, len(CASES))
     both = jax.vmap(native.step)(*jax.tree.map(lambda *leaves: jnp.stack(leaves), inputs, other))
-    assert_same_bits(jax.tree.map(lambda x: x[0], both), native_result)
-    assert_same_bits(jax.tree.map(lambda x: x[1], both), native.step(*other))
+    assert_same(jax.tree.map(lambda x: x[0], both), native_result)
+    assert_same(jax.tree.map(lambda x: x[1], both), native.step(*other))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e12])
@@ -198,7 +194,7 @@ def test_a_diverged_row_is_not_finite_and_alone(native, inputs, native_result, v
     result = native.step(state, *inputs[1:])
     jax.block_until_ready(result)
     sound = np.delete(np.arange(len(CASES)), FLIGHT)
-    assert_same_bits(*(jax.tree.map(lambda x: x[sound], r) for r in (result, native_result)))
+    assert_same(*(jax.tree.map(lambda x: x[sound], r) for r in (result, native_result)))
     assert not all(np.isfinite(leaf[FLIGHT]).all() for leaf in jax.tree.leaves(result))
     assert capfd.readouterr() == ("", "")
     assert not list(tmp_path.iterdir())

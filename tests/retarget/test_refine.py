@@ -9,14 +9,14 @@ from scipy.spatial.transform import Rotation
 
 from forgetmimic_jax.motion.contact import floor_points, floor_positions
 from forgetmimic_jax.motion.dynamics import FRICTION, RADIUS, floor_answer
-from forgetmimic_jax.motion.kinematics import generalized_velocity
+from forgetmimic_jax.motion.kinematics import generalized_velocity, heading
 from forgetmimic_jax.motion.motors import InverseDynamics, motor_loads
 from forgetmimic_jax.retarget.contact import human_contact
 from forgetmimic_jax.retarget.cycle import resampled
 from forgetmimic_jax.retarget.deepmimic import LEG_LENGTH, forward_kinematics, read_deepmimic
 from forgetmimic_jax.retarget.dynamics import floor_wrench, motor_torque
-from forgetmimic_jax.retarget.least_squares import Term, gauss_newton_step
-from forgetmimic_jax.retarget.planar import PlanarTransform, heading
+from forgetmimic_jax.retarget.least_squares import Residuals, gauss_newton_step
+from forgetmimic_jax.retarget.planar import PlanarTransform
 from forgetmimic_jax.retarget.pose import pose_of
 from forgetmimic_jax.retarget.refine import Problem, Weights, refine
 from forgetmimic_jax.retarget.retarget import inverse_kinematics, leg_scale, make_goals
@@ -89,7 +89,7 @@ def test_banded_step_is_the_dense_least_squares_solution(cyclic, frames):
     for reach in (0, 1, 3):
         first = np.arange(frames if cyclic else frames - reach)
         jacobians = {offset: rng.normal(size=(len(first), 2, nv)) for offset in range(reach + 1)}
-        term = Term(first, rng.normal(size=(len(first), 2)), jacobians)
+        term = Residuals(first, rng.normal(size=(len(first), 2)), jacobians)
         terms.append(term)
         for row, frame in enumerate(first):
             for line in range(2):
@@ -307,7 +307,7 @@ def test_a_cycle_closes(tmp_path, degrees, carried):
     assert len(moved.times) == 40
     assert np.degrees(step.yaw) == pytest.approx(carried, abs=1e-6)
     root = moved.rotations["root"]
-    turned = np.degrees(np.unwrap(heading(root)))
+    turned = np.degrees(np.unwrap(heading(root.as_quat(scalar_first=True))))
     assert turned[-1] - turned[0] == pytest.approx(carried * 39 / 40, abs=0.6)
     seam = (step.turn(root[0]) * root[-1].inv()).magnitude()
     inside = (root[1:] * root[:-1].inv()).magnitude().max()
