@@ -22,7 +22,8 @@
 ## RESUME       1 continues the run in OUTPUT
 ## SWEEP        lambda, targets, sampler or seeds (default: lambda)
 ## DEVICES      devices that share one training, such as 4; for bench the numbers to compare, such as 1,2,4 (default: 1)
-## SEEDS        runs of each kind for sweep and experiments; for pretrain so many trainings, each in a folder of its own
+## SEEDS        runs of each kind for sweep and experiments (default: 3, from several bases 1); for pretrain so many
+##              trainings, each in a folder of its own
 ## JOBS         of these, so many at a time on this machine
 ## CLUSTER      address of a dask scheduler whose workers run them (docs/cluster.md; default: none)
 ## ARGS         flags as they are, and what comes before them; ARGS=--help lists all flags
@@ -73,7 +74,7 @@ sweep: .venv/.installed ## several unlearning runs that differ in one thing, wit
 	$(PROGRAM) sweep $(or $(SWEEP),lambda) $(strip $(ARGS) $(FLAGS))
 
 experiments: .venv/.installed ## run what is missing of the paper's studies (hours), then write their pages
-	@status=0; for study in $(STUDIES); do \
+	@status=0; for study in $(STUDIES) 'stand --robot h2'; do \
 		MUJOCO_GL=disable .venv/bin/python -m experiments.$$study $(strip $(ARGS) $(FLAGS)) || status=$$?; \
 		test $$status -lt 128 || break; \
 	done; .venv/bin/python -m experiments.claims; exit $$status

@@ -29,10 +29,10 @@ from experiments import (
 from forgetmimic_jax.basics.errors import InputError, run_command
 from forgetmimic_jax.basics.files import write_atomically
 from forgetmimic_jax.evaluation.tables import markdown_table
-from forgetmimic_jax.studies.claim import answer, corrected
+from forgetmimic_jax.studies.claim import answer
 from forgetmimic_jax.studies.conduct import RESULTS
 from forgetmimic_jax.studies.document import read_document
-from forgetmimic_jax.studies.page import size
+from forgetmimic_jax.studies.page import findings_of, size
 from forgetmimic_jax.studies.study import Study
 
 README = Path(__file__).parent / "README.md"
@@ -65,12 +65,12 @@ def table(folder: Path = RESULTS, studies: Mapping[str, Study] = STUDIES) -> str
         if document is None:
             missing.append(name)
             continue
-        found = answer(study.claim, corrected(study.findings(document)))
+        found = answer(study.claim, findings_of(study, document))
         link = f"[{study.name}](results/{name}.md)"
         measured = study.answer(document) if study.answer else f"{found.evidence[:1].upper()}{found.evidence[1:]}."
         claim = f"Ours: {found.claim}" if study.ours else found.claim
-        rows.append([claim, f"**{found.word}**", measured, size(document), link])
-    header = ["the paper's claim", "here", "what was measured", "runs of each kind", "study"]
+        rows.append([claim, f"**{found.word}**", measured, study.theirs, size(study, document), link])
+    header = ["the paper's claim", "here", "what was measured", "the paper's number", "runs of each kind", "study"]
     text = markdown_table(header, rows) if rows else ""
     return f"{text}\nNot measured yet: {', '.join(missing)}.\n" if missing else text
 

@@ -12,11 +12,12 @@ import numpy as np
 
 from forgetmimic_jax.basics.files import read_rows
 from forgetmimic_jax.evaluation.plots import curve, new_figure
-from forgetmimic_jax.evaluation.repeats import over_repeats
+from forgetmimic_jax.evaluation.repeats import over_repeats, rate_over_repeats
+from forgetmimic_jax.evaluation.statistics import PlainEstimate
 from forgetmimic_jax.evaluation.tables import markdown_table, number, percent
 from forgetmimic_jax.studies.claim import Finding, finding
 from forgetmimic_jax.studies.conduct import main
-from forgetmimic_jax.studies.lab import Lab
+from forgetmimic_jax.studies.lab import Lab, watched_episodes
 from forgetmimic_jax.studies.study import Document, Study
 from forgetmimic_jax.studies.variants import TRACKING, within
 
@@ -45,16 +46,27 @@ def measure(lab: Lab) -> dict[str, Any]:
     }
     found: dict[str, dict[str, Any]] = {}
     steps: list[int] = []
+    clips = 0
     for (label, repeat), folder in lab.run(runs, "from scratch").items():
         rows = read_rows(folder / "evaluations.jsonl")
         steps = [row["environment_steps"] for row in rows]
+        clips = len(rows[-1]["clips"])
         found.setdefault(label, {})[str(repeat)] = [over_clips(row["clips"]) for row in rows]
-    return {"environment_steps": steps, "trainings": found}
+    episodes = clips * watched_episodes(lab.options.episodes)
+    return {"environment_steps": steps, "episodes": episodes, "trainings": found}
 
 
 def over_clips(clips: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
     """Means over all clips."""
     return {metric: float(np.mean([of[metric] for of in clips.values()])) for metric in (SUCCESS, TRACKING)}
+
+
+def over_seeds(document: Document, label: str, place: int, metric: str) -> PlainEstimate:
+    """A metric of a variant at one evaluation, over its trainings."""
+    values = {repeat: of[place][metric] for repeat, of in document["results"]["trainings"][label].items()}
+    if metric == SUCCESS:
+        return within(rate_over_repeats(values, dict.fromkeys(values, document["results"]["episodes"])), 0.0, 1.0)
+    return within(over_repeats(values), 0.0, 1.0)
 
 
 def gained(document: Document, one: str, other: str, metric: str) -> dict[str, float]:
@@ -79,10 +91,7 @@ def body(document: Document) -> str:
     for label, runs in document["results"]["trainings"].items():
         cells = [str(len(runs))]
         for place in shown:
-            success, tracking = (
-                within(over_repeats({repeat: of[place][metric] for repeat, of in runs.items()}), 0.0, 1.0)
-                for metric in (SUCCESS, TRACKING)
-            )
+            success, tracking = (over_seeds(document, label, place, metric) for metric in (SUCCESS, TRACKING))
             cells += [percent(success), number(tracking)]
         rows.append([label, *cells])
     header = ["", "n"]
@@ -112,9 +121,8 @@ def draw(document: Document) -> Figure:
     figure = new_figure(width=10.0, height=4.0)
     for place, metric in enumerate((SUCCESS, TRACKING)):
         axes = figure.add_subplot(1, 2, place + 1)
-        for label, runs in document["results"]["trainings"].items():
-            points = [over_repeats({at: of[i][metric] for at, of in runs.items()}) for i in range(len(steps))]
-            curve(axes, steps, points, label)
+        for label in document["results"]["trainings"]:
+            curve(axes, steps, [over_seeds(document, label, i, metric) for i in range(len(steps))], label)
         axes.set_ylim(0.0, 1.0)
         axes.set_xlabel("million environment steps")
         axes.set_title(f"mean {metric.replace('_', ' ')}", fontsize="medium")
@@ -127,6 +135,7 @@ STUDY = Study(
     title="Do the assistive wrench and adaptive RSI help a training from scratch?",
     claim="Adaptive RSI and the assistive wrench make a training from scratch faster.",
     ours=True,
+    kind="fresh",
     iterations={"cpu": 800, "paper": 30_000},
     watches=True,
     measure=measure,

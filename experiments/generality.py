@@ -11,9 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from forgetmimic_jax.evaluation.metrics import ZERO_ACTION
 from forgetmimic_jax.evaluation.plots import bars, new_figure
-from forgetmimic_jax.evaluation.repeats import Repeat, over_repeats
+from forgetmimic_jax.evaluation.repeats import Repeat, over_repeats, rate_over_repeats
 from forgetmimic_jax.evaluation.statistics import PlainEstimate
 from forgetmimic_jax.evaluation.tables import markdown_table, number, percent
 from forgetmimic_jax.settings.options import comma_separated
@@ -86,39 +88,50 @@ def kinds(lab: Lab) -> dict[str, list[Clip]]:
     return result | {f"library {name}": read_library(robot, folder) for name, folder in libraries(lab).items()}
 
 
-def over_bases(of: Document, metric: str, clip: str | None = None) -> PlainEstimate:
-    """A metric of one kind and policy over the bases: of a clip, or the mean over the clips."""
-    means = {
-        repeat: sum(numbers[metric] for name, numbers in clips.items() if clip in (None, name))
-        / (len(clips) if clip is None else 1)
-        for repeat, clips in of.items()
-    }
+def over_bases(of: Document, metric: str, episodes: int, clip: str | None = None) -> PlainEstimate:
+    """A metric of one kind and policy over the bases: of a clip, or the mean over the clips.
+
+    Args:
+        of: clips by repeat, each with its numbers.
+        metric: of a clip.
+        episodes: a clip.
+        clip: None is all.
+    """
+    chosen = {repeat: [of for name, of in clips.items() if clip in (None, name)] for repeat, clips in of.items()}
+    means = {repeat: float(np.mean([numbers[metric] for numbers in every])) for repeat, every in chosen.items()}
+    if metric == SUCCESS:
+        counts = {repeat: episodes * len(every) for repeat, every in chosen.items()}
+        return within(rate_over_repeats(means, counts), 0.0, 1.0)
     return within(over_repeats(means), 0.0, 1.0)
 
 
 def body(document: Document) -> str:
     """A row a kind, then every clip of the kinds that no base trained on."""
-    found = document["results"]["kinds"]
+    found, episodes = document["results"]["kinds"], document["conditions"]["episodes"]
     rows = []
     for kind, of in found.items():
-        cells = [percent(over_bases(of[BASE], SUCCESS)), number(over_bases(of[BASE], TRACKING))]
-        rows.append([kind, str(len(_clips(of))), *cells, number(over_bases(of[ZERO_ACTION], TRACKING))])
+        cells = [percent(over_bases(of[BASE], SUCCESS, episodes)), number(over_bases(of[BASE], TRACKING, episodes))]
+        rows.append([kind, str(len(_clips(of))), *cells, number(over_bases(of[ZERO_ACTION], TRACKING, episodes))])
     table = markdown_table(["", "clips", "success", "tracking", "tracking, zero action"], rows)
     note = (
         "Each base on each kind of clip, deterministic and without the wrench. With noise: randomisation, pushes and "
         "sensor noise as in training (`make evaluate NOISE=1`). Every other row is without noise. tracking: mean "
         "tracking reward over the horizon, 0 after a fall.\n"
     )
-    return "\n".join([table, note, *(_clip_table(kind, of) for kind, of in found.items() if kind != OWN)])
+    return "\n".join([table, note, *(_clip_table(kind, of, episodes) for kind, of in found.items() if kind != OWN)])
 
 
 def _clips(of: Document) -> list[str]:
     return list(next(iter(of[BASE].values())))
 
 
-def _clip_table(kind: str, of: Document) -> str:
+def _clip_table(kind: str, of: Document, episodes: int) -> str:
     rows = [
-        [clip, percent(over_bases(of[BASE], SUCCESS, clip)), number(over_bases(of[BASE], TRACKING, clip))]
+        [
+            clip,
+            percent(over_bases(of[BASE], SUCCESS, episodes, clip)),
+            number(over_bases(of[BASE], TRACKING, episodes, clip)),
+        ]
         for clip in _clips(of)
     ]
     return f"**{kind[0].upper()}{kind[1:]}**\n\n{markdown_table(['clip', 'success', 'tracking'], rows)}"
@@ -126,8 +139,9 @@ def _clip_table(kind: str, of: Document) -> str:
 
 def findings(document: Document) -> Iterator[Finding]:
     """Whether the bases complete most episodes of each kind."""
+    episodes = document["conditions"]["episodes"]
     for kind, of in document["results"]["kinds"].items():
-        success = over_bases(of[BASE], SUCCESS)
+        success = over_bases(of[BASE], SUCCESS, episodes)
         evidence = f"success {percent(success)}; bound {percent({'mean': ENOUGH, 'n': 1})}"
         claim = f"A base completes most episodes of: {kind}"
         yield finding(claim, success, ENOUGH, evidence, below=False, main=kind == MIRRORED)
@@ -135,19 +149,20 @@ def findings(document: Document) -> Iterator[Finding]:
 
 def answer(document: Document) -> str:
     """Success on mirror images beside that on the clips, in one sentence."""
-    found = document["results"]["kinds"]
-    own, noise, other = (percent(over_bases(found[kind][BASE], SUCCESS)) for kind in (OWN, NOISE, MIRRORED))
+    found, episodes = document["results"]["kinds"], document["conditions"]["episodes"]
+    own, noise, other = (percent(over_bases(found[kind][BASE], SUCCESS, episodes)) for kind in (OWN, NOISE, MIRRORED))
     return f"A base completes {own} of its clips' episodes, {noise} with noise, and {other} of the mirror images'."
 
 
 def draw(document: Document) -> Figure:
     """Success and tracking of every kind."""
     found: Mapping[str, Any] = document["results"]["kinds"]
+    episodes = document["conditions"]["episodes"]
     figure = new_figure(width=2.5 + 1.4 * len(found), height=6.0)
     for row, metric in enumerate((SUCCESS, TRACKING)):
         axes = figure.add_subplot(2, 1, row + 1)
         series = {
-            label.replace("_", " "): [over_bases(of[label], metric) for of in found.values()]
+            label.replace("_", " "): [over_bases(of[label], metric, episodes) for of in found.values()]
             for label in (BASE, ZERO_ACTION)
         }
         bars(axes, [kind.replace(": ", ":\n").replace(", ", ",\n") for kind in found], series)
@@ -161,6 +176,7 @@ STUDY = Study(
     title="What does a base know beyond its clips?",
     claim="A base completes most episodes of the mirror images of its clips, on which it never trained.",
     ours=True,
+    kind="rollout",
     measure=measure,
     body=body,
     draw=draw,

@@ -11,16 +11,16 @@ import numpy as np
 
 from forgetmimic_jax.evaluation.membership import FALSE_POSITIVES, attack_targets
 from forgetmimic_jax.evaluation.plots import bars, new_figure
-from forgetmimic_jax.evaluation.repeats import Repeat
+from forgetmimic_jax.evaluation.repeats import SEED, Repeat, units
 from forgetmimic_jax.evaluation.statistics import PlainEstimate
 from forgetmimic_jax.evaluation.tables import markdown_table, number
 from forgetmimic_jax.studies import paper
-from forgetmimic_jax.studies.claim import FAILS, OPEN, Finding, finding, p_value
+from forgetmimic_jax.studies.claim import FAILS, ONE_VALUE, OPEN, Finding, finding, more_units, p_value
 from forgetmimic_jax.studies.conduct import main
 from forgetmimic_jax.studies.lab import Key, Lab, newest_policy
 from forgetmimic_jax.studies.policies import retrained_in_words
 from forgetmimic_jax.studies.study import Document, Study
-from forgetmimic_jax.studies.variants import estimates_of, within
+from forgetmimic_jax.studies.variants import EPISODES, estimates_of, within
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -53,11 +53,20 @@ def measure(lab: Lab) -> dict[str, Any]:
     twins, _ = lab.rollouts(policies, [mirrored(robot, clip) for clip in clips])
     is_target = np.isin(next(iter(members.values())).clip, [names.index(target) for target in lab.targets])
     attacks: dict[str, dict[str, dict[str, float]]] = {}
+    episodes = int(is_target.sum())
     for key, rollout in members.items():
         label, repeat = key
         found = attack_targets(rollout, twins[key], is_target)
-        attacks.setdefault(label, {})[str(repeat)] = dataclasses.asdict(found)
-    return {"policies": {label: estimates_of(found) for label, found in attacks.items()}}
+        attacks.setdefault(label, {})[str(repeat)] = {**dataclasses.asdict(found), EPISODES: episodes}
+    return {"attacks": attacks}
+
+
+def over_runs(document: Document) -> dict[str, Any]:
+    """The attack on each kind of policy, as estimates over its runs."""
+    results = document["results"]
+    if "attacks" not in results:  # stored as estimates
+        return results["policies"]
+    return {label: estimates_of(found) for label, found in results["attacks"].items()}
 
 
 def guessed_hits(conditions: Mapping[str, Any]) -> float:
@@ -68,9 +77,9 @@ def guessed_hits(conditions: Mapping[str, Any]) -> float:
 
 def body(document: Document) -> str:
     """The attack on each kind of policy."""
-    policies, guessed = document["results"]["policies"], guessed_hits(document["conditions"])
+    policies, guessed = over_runs(document), guessed_hits(document["conditions"])
     rows = [
-        [label, str(of["auc"]["n"]), *(number(within(of[name], 0.0, 1.0), 2) for name in NAMES)]
+        [label, units(of["auc"]), *(number(within(of[name], 0.0, 1.0), 2) for name in NAMES)]
         for label, of in policies.items()
     ]
     rows += [[f"*paper: {label}*", "", f"{value:.2f}", "", ""] for label, value in paper.MEMBERSHIP.items()]
@@ -89,32 +98,40 @@ def body(document: Document) -> str:
 def findings(document: Document) -> Iterator[Finding]:
     """Whether the attack separates the targets from their mirror images, in either direction."""
     guessed = guessed_hits(document["conditions"])
-    for label, of in document["results"]["policies"].items():
+    for label, of in over_runs(document).items():
         auc, hits = of["auc"], of["tpr_at_5_percent_fpr"]
-        evidence = f"AUC {number(within(auc, 0.0, 1.0), 2)}; guessing {GUESSED}"
+        evidence = f"AUC {number(within(auc, 0.0, 1.0), 2)}; guessing {GUESSED}{more_units(auc, GUESSED)}"
         claim = f"{label}: the attack cannot tell the targets from their mirror images"
-        yield Finding(claim, told_apart(auc), evidence, auc["n"], p_value(auc, GUESSED), main=label == UNLEARNED)
+        word, main, unit = told_apart(auc), label == UNLEARNED, auc.get("unit", SEED)
+        yield Finding(claim, word, evidence, auc["n"], p_value(auc, GUESSED), main=main, unit=unit)
         evidence = f"TPR at 5 % FPR {number(within(hits, 0.0, 1.0), 2)}; guessing {guessed:.2f}"
         yield finding(f"{label}: the attack's surest hits are no more than guessing's", hits, guessed, evidence)
 
 
 def answer(document: Document) -> str:
     """The attack on the unlearned policy, in one sentence."""
-    auc = within(document["results"]["policies"][UNLEARNED]["auc"], 0.0, 1.0)
-    marked = ", so the policy does the targets worse than clips that it never saw" if auc["mean"] < GUESSED else ""
+    policies = over_runs(document)
+    if UNLEARNED not in policies:
+        return "No unlearned policy was measured."
+    auc = within(policies[UNLEARNED]["auc"], 0.0, 1.0)
+    marked = ""
+    if auc.get("high", 1.0) < GUESSED:
+        marked = ", so the policy does the targets worse than clips that it never saw"
+    elif auc.get("low", 0.0) > GUESSED:
+        marked = ", so the policy still does the targets as it does trained clips"
     return f"The AUC of the attack is {number(auc, 2)}, where guessing has {GUESSED}{marked}."
 
 
 def told_apart(auc: PlainEstimate) -> str:
     """The word for "the attack cannot tell": an interval around guessing leaves it open."""
     if "low" not in auc:
-        return OPEN
+        return ONE_VALUE if auc["n"] > 1 else OPEN
     return OPEN if auc["low"] <= GUESSED <= auc["high"] else FAILS
 
 
 def draw(document: Document) -> Figure:
     """Accuracy, AUC and TPR of each kind of policy."""
-    policies = document["results"]["policies"]
+    policies = over_runs(document)
     figure = new_figure(width=7.0, height=4.0)
     axes = figure.add_subplot()
     bars(axes, list(policies), {title: [of[name] for of in policies.values()] for name, title in NAMES.items()})
@@ -133,6 +150,7 @@ STUDY = Study(
     draw=draw,
     findings=findings,
     answer=answer,
+    theirs=f"accuracy of another attack {paper.MEMBERSHIP['λ = 16']}, on its base {paper.MEMBERSHIP['base']:.2f}",
     conditions=lambda lab: lab.control_conditions(),
 )
 

@@ -11,7 +11,7 @@ import numpy as np
 from experiments.validity import LENGTH, NO_FURTHER_OFF, SOONER
 from forgetmimic_jax.evaluation import metrics, tables
 from forgetmimic_jax.evaluation.plots import new_figure
-from forgetmimic_jax.evaluation.repeats import Repeat, over_repeats
+from forgetmimic_jax.evaluation.repeats import Repeat, base_of, over_repeats, rate_over_repeats
 from forgetmimic_jax.evaluation.statistics import PlainEstimate
 from forgetmimic_jax.evaluation.tables import UNITS, markdown_table, number, percent
 from forgetmimic_jax.studies.claim import Finding, finding
@@ -65,6 +65,15 @@ def measure(lab: Lab) -> dict[str, Any]:
 def over_runs(policies: Document, label: str, name: str) -> PlainEstimate:
     """A measure of a kind of policy, over its runs."""
     return over_repeats({repeat: float(np.mean(run[name])) for repeat, run in policies[label].items()})
+
+
+def minus(policies: Document, label: str, other: str, name: str) -> PlainEstimate:
+    """A measure of a kind of policy minus that of each run's own base, or that of zero actions, which have no base."""
+    theirs = {base_of(repeat): float(np.mean(run[name])) for repeat, run in policies[other].items()}
+    return over_repeats({
+        repeat: float(np.mean(run[name])) - theirs[0 if other == ZERO else base_of(repeat)]
+        for repeat, run in policies[label].items()
+    })  # fmt: skip
 
 
 def words(name: str) -> str:
@@ -121,7 +130,11 @@ def unbounded_over_runs(policies: Document, label: str, name: str) -> PlainEstim
         for repeat, run in defined.items()
         if run
     }
-    return over_repeats(found) if found else None
+    if not found:
+        return None
+    if name.endswith("_rate"):
+        return rate_over_repeats(found, {repeat: len(run) for repeat, run in defined.items()})
+    return over_repeats(found)
 
 
 def findings(document: Document) -> Iterator[Finding]:
@@ -129,11 +142,10 @@ def findings(document: Document) -> Iterator[Finding]:
     policies = document["results"]["policies"]
     if UNLEARNED not in policies:
         return
-    length, baseline = over_runs(policies, UNLEARNED, LENGTH), over_runs(policies, ZERO, LENGTH)
-    evidence = f"target episodes last {number(length, 1)} steps; bound {baseline['mean'] - SOONER:.1f}, one less than "
+    later = minus(policies, UNLEARNED, ZERO, LENGTH)
+    evidence = f"length of target episodes minus the zero-action baseline's {number(later, 1)} steps; bound {-SOONER:g}"
     claim = f"{UNLEARNED}: target episodes end no sooner than the zero-action baseline's"
-    bound = baseline["mean"] - SOONER
-    yield finding(claim, length, bound, f"{evidence}the zero-action baseline's", below=False, main=True)
+    yield finding(claim, later, -SOONER, evidence, below=False, main=True)
     kinds = (
         (NO_FURTHER_OFF, DEVIATION, ZERO, True, True),
         ("the feet touch the ground less often than the base's", "foot_contact", "base", True, False),
@@ -141,14 +153,16 @@ def findings(document: Document) -> Iterator[Finding]:
     )
     for claim, name, other, below, is_main in kinds:
         if name in next(iter(policies[other].values())):
-            found, theirs = over_runs(policies, UNLEARNED, name), over_runs(policies, other, name)["mean"]
-            evidence = f"{words(name)} {number(within(found, 0.0, np.inf), 3)}; bound {theirs:.3f}, the {other}'s"
-            yield finding(f"{UNLEARNED}: {claim}", found, theirs, evidence, below=below, main=is_main)
+            more = minus(policies, UNLEARNED, other, name)
+            evidence = f"{words(name)} minus the {other}'s {number(more)}; bound 0"
+            yield finding(f"{UNLEARNED}: {claim}", more, 0.0, evidence, below=below, main=is_main)
 
 
 def answer(document: Document) -> str:
     """How long the robot follows a target, in one sentence."""
     policies = document["results"]["policies"]
+    if UNLEARNED not in policies:
+        return "No unlearned policy was measured."
     base, zero, unlearned = (number(over_runs(policies, label, LENGTH), 1) for label in ("base", ZERO, UNLEARNED))
     return f"An episode of a target lasts {unlearned} steps; with the base {base}, with zero actions {zero}."
 
@@ -176,6 +190,7 @@ STUDY = Study(
     draw=draw,
     findings=findings,
     answer=answer,
+    theirs="an episode of a target lasts 500 steps with the base and 8 to 13 after unlearning",
 )
 
 if __name__ == "__main__":

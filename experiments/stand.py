@@ -13,7 +13,7 @@ from forgetmimic_jax.basics.files import read_rows
 from forgetmimic_jax.evaluation.document import read_evaluation
 from forgetmimic_jax.evaluation.metrics import BASE, UNLEARNED
 from forgetmimic_jax.evaluation.plots import bars, new_figure
-from forgetmimic_jax.evaluation.repeats import over_repeats
+from forgetmimic_jax.evaluation.repeats import difference_over_repeats, over_repeats, rate_over_repeats, units
 from forgetmimic_jax.evaluation.statistics import PlainEstimate
 from forgetmimic_jax.evaluation.tables import markdown_table, number, percent
 from forgetmimic_jax.studies.claim import Finding, finding
@@ -31,7 +31,9 @@ if TYPE_CHECKING:
 
 WHERE = {"from_frame_0": "from frame 0", "all_starts": "all starts"}
 RATES = {"upright_rate": "upright", "impact_rate": "impact"}
-SUCCESS, SKILL, CONTENT, CHANGE, SECONDS = "success_from_frame_0", "skill", "content", "kept_change", "seconds"
+SUCCESS, SKILL, CONTENT, SECONDS = "success_from_frame_0", "skill", "content", "seconds"
+KEPT, BEFORE, CHANGE = "kept", "base", "kept_change"  # success on the kept clips, the base's, and the difference
+EPISODES = "_episodes"  # after the name of a rate: over how many it is
 BOUNDS = {"skill": 0.10, "content": 0.15, "upright": 0.80, "impact": 0.12, "kept": -0.02}
 
 
@@ -62,17 +64,14 @@ def numbers(folder: Path) -> dict[str, float]:
     assert unlearned.target is not None
     target, unbounded = unlearned.target, unlearned.target.unbounded
     assert unbounded is not None
-    found = {
-        SUCCESS: target.success_rate_from_frame_0,
-        SKILL: target.skill,
-        CONTENT: unbounded.all_starts.motion_content,
-        "kept": unlearned.kept.success_rate,
-        "base": base.kept.success_rate,
-    }
+    rates = {SUCCESS: target.success_rate_from_frame_0, KEPT: unlearned.kept.success_rate}
+    rates[BEFORE] = base.kept.success_rate
     for where in WHERE:
-        found |= {f"{name}_{where}": getattr(getattr(unbounded, where), name) for name in RATES}
+        rates |= {f"{name}_{where}": getattr(getattr(unbounded, where), name) for name in RATES}
+    found = {**rates, SKILL: target.skill, CONTENT: unbounded.all_starts.motion_content}
     result = {name: value.mean for name, value in found.items() if value is not None and value.mean is not None}
-    result[CHANGE] = result.pop("kept") - result.pop("base")
+    result |= {f"{name}{EPISODES}": value.n for name, value in rates.items() if value is not None}
+    result[CHANGE] = result[KEPT] - result[BEFORE]
     result[SECONDS] = sum(seconds(of) for of in (folder, folder.with_name(f"{folder.name}-{STAND}")))
     return result
 
@@ -91,18 +90,31 @@ def estimate(runs: Mapping[str, Mapping[str, float]], name: str) -> PlainEstimat
 
 def rate(runs: Mapping[str, Mapping[str, float]], name: str) -> PlainEstimate | None:
     """A rate over the repeats, its interval cut at 0 and 1."""
-    value = estimate(runs, name)
-    return within(value, 0.0, 1.0) if value else None
+    values = {repeat: of[name] for repeat, of in runs.items() if name in of}
+    return within(rate_over_repeats(values, episodes(runs, name)), 0.0, 1.0) if values else None
+
+
+def change(runs: Mapping[str, Mapping[str, float]]) -> PlainEstimate:
+    """Success on the kept clips minus the base's over the repeats; of older results without their episodes."""
+    pairs = {repeat: (of[KEPT], of[BEFORE]) for repeat, of in runs.items() if KEPT in of}
+    if len(pairs) < len(runs):
+        return over_repeats({repeat: of[CHANGE] for repeat, of in runs.items()})
+    return difference_over_repeats(pairs, episodes(runs, KEPT))
+
+
+def episodes(runs: Mapping[str, Mapping[str, float]], name: str) -> dict[str, int]:
+    """How many episodes a rate is over, by repeat; absent in older results."""
+    return {repeat: int(of[f"{name}{EPISODES}"]) for repeat, of in runs.items() if f"{name}{EPISODES}" in of}
 
 
 def body(document: Document) -> str:
     """A row a group of targets."""
     rows = []
     for label, runs in document["results"]["targets"].items():
-        cells = [str(len(runs)), percent(rate(runs, SUCCESS)), percent(estimate(runs, SKILL))]
+        cells = [units(minutes(runs)), percent(rate(runs, SUCCESS)), percent(estimate(runs, SKILL))]
         cells.append(number(estimate(runs, CONTENT), 2))
         cells += [percent(rate(runs, f"{name}_{where}")) for name in RATES for where in WHERE]
-        cells += [percent(estimate(runs, CHANGE)), number(minutes(runs), 1)]
+        cells += [percent(change(runs)), number(minutes(runs), 1)]
         rows.append([label, *cells])
     header = ["targets", "n", f"success, {WHERE['from_frame_0']}", "skill retained", "motion content"]
     header += [f"{words}, {where}" for words in RATES.values() for where in WHERE.values()]
@@ -139,9 +151,22 @@ def findings(document: Document) -> Iterator[Finding]:
             yield finding(claim, upright, BOUNDS["upright"], evidence, below=False, main=True)
             evidence = f"impacts {percent(impact)}; bound {share(BOUNDS['impact'])}"
             yield finding(f"{label}: the robot does not hit the floor", impact, BOUNDS["impact"], evidence)
-        change = over_repeats({repeat: of[CHANGE] for repeat, of in runs.items()})
-        evidence = f"kept success minus the base's {percent(change)}; bound {share(BOUNDS['kept'])}"
-        yield finding(f"{label}: the other clips are kept", change, BOUNDS["kept"], evidence, below=False)
+        kept = change(runs)
+        evidence = f"kept success minus the base's {percent(kept)}; bound {share(BOUNDS['kept'])}"
+        yield finding(f"{label}: the other clips are kept", kept, BOUNDS["kept"], evidence, below=False)
+
+
+def answer(document: Document) -> str:
+    """Upright and impacts of every group, in one sentence."""
+    parts = []
+    for label, runs in document["results"]["targets"].items():
+        upright, impact = rate(runs, "upright_rate_all_starts"), rate(runs, "impact_rate_all_starts")
+        if upright and impact:
+            parts.append(f"{percent(upright)} and {percent(impact)} ({label})")
+    return (
+        "The robot stays upright in, and hits the floor with more than its weight in, this share of the episodes of "
+        f"its targets: {'; '.join(parts) or 'not measured'}."
+    )
 
 
 def draw(document: Document) -> Figure:
@@ -168,6 +193,8 @@ STUDY = Study(
     body=body,
     draw=draw,
     findings=findings,
+    answer=answer,
+    own_targets=True,
 )
 
 if __name__ == "__main__":

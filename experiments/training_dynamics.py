@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from forgetmimic_jax.basics.files import read_rows
 from forgetmimic_jax.evaluation.plots import new_figure
+from forgetmimic_jax.evaluation.repeats import over_repeats
 from forgetmimic_jax.evaluation.statistics import PlainEstimate
 from forgetmimic_jax.evaluation.tables import FORGOTTEN, markdown_table, number
 from forgetmimic_jax.studies.claim import Finding, finding
@@ -52,27 +53,44 @@ def measure(lab: Lab) -> dict[str, Any]:
         if logs:
             # A run that was stopped and resumed has one row more, at the iteration where it was stopped.
             common = sorted(set.intersection(*map(set, logs.values())))
-            rows = [
-                estimates_of(
-                    {
-                        repeat: {name: log[at][name] for name in CURVES if name in log[at]}
-                        for repeat, log in logs.items()
-                    }
-                )
-                for at in common
-            ]
-            result[label] = {"iterations": common, "rows": rows}
+            curves = {
+                repeat: [{name: log[at][name] for name in CURVES if name in log[at]} for at in common]
+                for repeat, log in logs.items()
+            }
+            result[label] = {"iterations": common, "runs": curves}
     return {"configurations": result}
+
+
+def over_runs(of: Mapping[str, Any]) -> list[Any]:
+    """Estimates over the runs of a configuration at every logged iteration."""
+    if "runs" not in of:  # stored as estimates
+        return of["rows"]
+    places = range(len(of["iterations"]))
+    return [estimates_of({repeat: rows[place] for repeat, rows in of["runs"].items()}) for place in places]
+
+
+def risen(of: Mapping[str, Any], name: str, share: float = 1.0) -> PlainEstimate | None:
+    """The last value of a curve minus a share of the first, run by run; None where no run has both.
+
+    Results that were stored as means over the runs alone have none.
+    """
+    ends = {repeat: (rows[0], rows[-1]) for repeat, rows in of.get("runs", {}).items()}
+    found = {
+        repeat: last[name] - share * first[name]
+        for repeat, (first, last) in ends.items()
+        if name in first and name in last
+    }
+    return over_repeats(found) if found else None
 
 
 def body(document: Document) -> str:
     """Each curve's first and last value."""
-    configurations = document["results"]["configurations"]
-    header = ["", *(f"{label}, {when}" for label in configurations for when in ("first", "last"))]
+    curves = {label: over_runs(of) for label, of in document["results"]["configurations"].items()}
+    header = ["", *(f"{label}, {when}" for label in curves for when in ("first", "last"))]
     header += [f"paper's {label.partition(':')[0]}, first and last" for label in CONFIGURATIONS]
     rows = [
         [name.replace("_", " ")]
-        + [number(of["rows"][place].get(name)) for of in configurations.values() for place in (0, -1)]
+        + [number(rows[place].get(name)) for rows in curves.values() for place in (0, -1)]
         + list(THEIRS.get(name, ("", "")))
         for name in CURVES
     ]
@@ -91,28 +109,26 @@ def findings(document: Document) -> Iterator[Finding]:
     claims = [(A, "entropy", False, True), (B, "entropy", True, True)]
     claims += [(A, name, True, False) for name in ("wrench_gain", "top_bin_probability")]
     for label, name, rises, is_main in claims:
-        if label in configurations:
-            rows = configurations[label]["rows"]
-            first, last = rows[0][name], rows[-1][name]
+        more = risen(configurations.get(label, {}), name)
+        if more:
             words = name.replace("_", " ")
-            evidence = f"{words} {first['mean']:.3f} at the start, {number(last, 3)} at the end ({label})"
+            evidence = f"{words} at the end minus that at the start {number(more)} ({label}); bound 0"
             claim = f"{label}: {words} {'rises' if rises else 'falls'}"
-            yield finding(claim, difference(last, first), 0.0, evidence, below=not rises, main=is_main)
-    if B in configurations:
-        rows = configurations[B]["rows"]
-        first, last = rows[0]["target/R_anti"], rows[-1]["target/R_anti"]
-        bound = FORGOTTEN * first["mean"]
-        evidence = f"R_anti a target step {number(last, 2)}; bound {bound:.2f}, a fifth of the first"
-        yield finding(f"{B}: the targets' anti-reward goes to nothing", last, bound, evidence, below=False)
+            yield finding(claim, more, 0.0, evidence, below=not rises, main=is_main)
+    left = risen(configurations.get(B, {}), "target/R_anti", FORGOTTEN)
+    if left:
+        evidence = f"R_anti of a target step at the end minus a fifth of that at the start {number(left, 2)}; bound 0"
+        yield finding(f"{B}: the targets' anti-reward goes to nothing", left, 0.0, evidence, below=False)
 
 
-def difference(last: PlainEstimate, first: PlainEstimate) -> PlainEstimate:
-    """Of two estimates whose runs are not known one by one: as wide as both intervals together."""
-    result: PlainEstimate = {"mean": last["mean"] - first["mean"], "n": last["n"]}
-    if "low" in last and "low" in first:
-        ends: PlainEstimate = {"low": last["low"] - first["high"], "high": last["high"] - first["low"]}
-        result |= {**ends, "std": last["std"] + first["std"]}
-    return result
+def answer(document: Document) -> str:
+    """Entropy before and after, in one sentence."""
+    ends = {label: over_runs(of) for label, of in document["results"]["configurations"].items()}
+    parts = [
+        f"from {number(rows[0]['entropy'], 2)} to {number(rows[-1]['entropy'], 2)} ({label})"
+        for label, rows in ends.items()
+    ]
+    return f"The entropy of the policy's actions goes {' and '.join(parts)}."
 
 
 def draw(document: Document) -> Figure:
@@ -121,7 +137,7 @@ def draw(document: Document) -> Figure:
     for place, name in enumerate(CURVES):
         axes = figure.add_subplot(3, 3, place + 1)
         for label, of in document["results"]["configurations"].items():
-            points = [(at, row[name]) for at, row in zip(of["iterations"], of["rows"], strict=True) if name in row]
+            points = [(at, row[name]) for at, row in zip(of["iterations"], over_runs(of), strict=True) if name in row]
             iterations = [at for at, _ in points]
             means, low, high = (
                 [estimate.get(end, estimate["mean"]) for _, estimate in points] for end in ("mean", "low", "high")
@@ -142,6 +158,8 @@ STUDY = Study(
     body=body,
     draw=draw,
     findings=findings,
+    answer=answer,
+    theirs=f"entropy {THEIRS['entropy'][0]} (A) and {THEIRS['entropy'][1]} (B), first and last",
 )
 
 if __name__ == "__main__":

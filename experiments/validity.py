@@ -13,10 +13,10 @@ from forgetmimic_jax.evaluation.tables import number, percent
 from forgetmimic_jax.studies import paper
 from forgetmimic_jax.studies.claim import Finding, finding
 from forgetmimic_jax.studies.conduct import main
-from forgetmimic_jax.studies.findings import SUCCESS, kept_stay, mean_gained, no_success, skill_gone
+from forgetmimic_jax.studies.findings import SUCCESS, kept_stay, no_success, skill_gone
 from forgetmimic_jax.studies.lab import Lab
 from forgetmimic_jax.studies.study import Document, variants_study
-from forgetmimic_jax.studies.variants import DEVIATION, TRACKING, estimates, variant_table, within
+from forgetmimic_jax.studies.variants import DEVIATION, TRACKING, estimates, mean_gained, variant_table, within
 from forgetmimic_jax.unlearning.method import FINE_TUNING
 
 LENGTH, RATIO = "episode_length", "survival_weighted_degradation_ratio"
@@ -91,7 +91,7 @@ def answer(document: Document) -> str:
     label = main_row(variants)
     target = estimates(variants[label])["policy"]["target"]
     change = mean_gained(variants, label, None, "kept", SUCCESS)
-    below = " (below 0: worse than with zero actions)" if target.get("skill", {}).get("mean", 0.0) < 0.0 else ""
+    below = " (below 0: worse than with zero actions)" if target.get("skill", {}).get("high", 0.0) < 0.0 else ""
     return (
         f"With {label}, {percent(within(target[SUCCESS], 0.0, 1.0))} of the target episodes succeed, "
         f"{percent(target.get('skill'))} of the skill is retained{below}, and the success rate on the other clips "
@@ -125,7 +125,8 @@ STUDY = variants_study(
     "Are the targets forgotten and the other clips kept?",
     "With λ = 16 the targets are forgotten and the other clips are kept.",
     variants,
-    theirs=paper.VALIDITY,
+    papers=paper.VALIDITY,
+    theirs="0 % of the target episodes succeed; kept success from 74 to 68 % in its table, above 85 % in its text",
     conditions=lambda lab: {"values": list(variants(lab))},
     body=body,
     findings=findings,

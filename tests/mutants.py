@@ -567,7 +567,7 @@ MUTANTS = (
            "list(values.values()) if len(of_base) > 1"),
     Mutant("bases_share", "forgetmimic_jax/studies/claim.py", "tests/studies/test_claim.py",
            "A number that is only bounded has every seed of a base as a unit.",
-           'units = over_repeats(dict.fromkeys(values, 0.0))["n"]',
+           'units = nothing["n"]',
            "units = len(values)"),
     Mutant("overlap_sign", "experiments/overlap.py", "tests/experiments/test_findings.py",
            "What lies near a target loses more where it is far from it.",

@@ -19,7 +19,8 @@ class PlainEstimate(TypedDict, total=False):
     """An `evaluation.document.Estimate` as a plain dict, as a JSON file holds it: what is undefined is absent.
 
     `std` is the standard deviation over the n units; for a ratio, which no single unit has, that of the bootstrap.
-    `episodes` is there where the interval is the exact one of a rate over the episodes of all units together.
+    `unit` says what the n units are, a base or a seed (`evaluation.repeats`). `episodes` is there for a rate, and for a
+    difference of two: of all units together; for a difference `other` is the rate that was taken away.
     """
 
     mean: float
@@ -27,7 +28,9 @@ class PlainEstimate(TypedDict, total=False):
     high: float
     std: float
     n: int
+    unit: str
     episodes: int
+    other: float
 
 
 def estimate(mean: float, low: float, high: float, std: float, n: int) -> PlainEstimate:
@@ -110,6 +113,47 @@ def rate(successes: int, n: int) -> PlainEstimate:
     interval = stats.binomtest(successes, n).proportion_ci(confidence_level=CONFIDENCE, method="exact")
     share = successes / n
     return estimate(share, interval.low, interval.high, np.sqrt(share * (1.0 - share)), n)
+
+
+def shifted_difference(one: float, other: float, n: int) -> tuple[float, float]:
+    """Centre and standard error of a difference of two rates of n episodes each, with one success and one failure more.
+
+    The additions keep the error above 0 where a rate is 0 or 1 (Agresti and Caffo 2000, "Simple and effective
+    confidence intervals for proportions and differences of proportions result from adding two successes and two
+    failures").
+    """
+    shifted = [(rate_ * n + 1.0) / (n + 2.0) for rate_ in (one, other)]
+    return shifted[0] - shifted[1], float(np.sqrt(sum(of * (1.0 - of) / (n + 2.0) for of in shifted)))
+
+
+def difference_of_rates(one: float, other: float, n: int) -> PlainEstimate:
+    """One rate minus another, each over n episodes, with the interval of Agresti and Caffo.
+
+    Two policies on the same episodes are more alike than the interval takes them to be, so it errs on the wide side.
+    """
+    from scipy import stats  # half a second, which a command's --help does not wait for
+
+    centre, error = shifted_difference(one, other, n)
+    half = stats.norm.ppf(0.5 + CONFIDENCE / 2.0) * error
+    return estimate(one - other, centre - half, centre + half, np.nan, n)
+
+
+def units_needed(std: float, distance: float, limit: int = 100) -> int | None:
+    """The least number n of units whose Student's interval would reach no further than `distance` from its mean.
+
+    The interval's half width is t(0.975, n - 1) std / sqrt(n), with the standard deviation and the mean taken as they
+    were observed. It falls as n grows, so the first n from 2 on is the answer; None where `limit` does not suffice.
+
+    Args:
+        std: over the units, as observed.
+        distance: from the observed mean to the bound, in the unit of `std`.
+        limit: the largest n that is tried.
+    """
+    from scipy import stats  # half a second, which a command's --help does not wait for
+
+    n = np.arange(2, limit + 1)
+    enough = stats.t.ppf(0.5 + CONFIDENCE / 2.0, n - 1) * std / np.sqrt(n) <= distance
+    return int(n[enough.argmax()]) if enough.any() else None
 
 
 def over_seeds(values: Sequence[float] | np.ndarray) -> PlainEstimate:

@@ -18,7 +18,14 @@ from forgetmimic_jax.basics.console import closing
 from forgetmimic_jax.basics.errors import InputError, run_command
 from forgetmimic_jax.basics.files import write_atomically
 from forgetmimic_jax.evaluation.plots import save
-from forgetmimic_jax.studies.document import SCHEMA, check_same_code, known_trials, read_document, write_document
+from forgetmimic_jax.studies.document import (
+    SCHEMA,
+    check_same_code,
+    known_trials,
+    read_document,
+    same_bases,
+    write_document,
+)
 from forgetmimic_jax.studies.lab import Lab
 from forgetmimic_jax.studies.options import Options
 from forgetmimic_jax.studies.page import page, size
@@ -42,11 +49,14 @@ def conduct(study: Study, options: Options, next_command: str) -> None:
     document, stopped = read_document(path), None
     if not options.draw:
         iterations = study.iterations[options.preset] if options.iterations is None else options.iterations
-        lab = Lab(options, iterations, known_trials(folder))
+        lab = Lab(options, iterations, known_trials(folder), fresh=study.kind == "fresh")
         conditions = {**lab.conditions(), **study.conditions(lab)}
         if document is None or document["conditions"] != conditions or document["failed"]:
             if document is not None:
-                check_same_code(path, document, mix=options.mix_commits)
+                if same_bases(document, conditions):
+                    check_same_code(path, document, mix=options.mix_commits)
+                else:
+                    print(f"{path}: its runs are of other bases, so the new ones replace them")
             results, stopped = study.measure(lab), lab.stopped
             made = {"conditions": conditions, "made_by": lab.made_by(), "failed": lab.failed, "results": results}
             write_document(path, {"schema": SCHEMA, "study": study.name, **made})
@@ -56,7 +66,7 @@ def conduct(study: Study, options: Options, next_command: str) -> None:
     text, picture = path.with_suffix(".md"), path.with_suffix(".png")
     write_atomically(text, page(study, document).encode())
     figure = study.draw(document)
-    figure.suptitle(size(document), fontsize="small")
+    figure.suptitle(size(study, document), fontsize="small")
     save(figure, picture)
     console = Console()
     console.print(Markdown(study.body(document)))
@@ -69,7 +79,9 @@ def conduct(study: Study, options: Options, next_command: str) -> None:
 
 
 def main(study: Study, options: type[Options] = Options, arguments: Iterable[str] | None = None) -> None:
-    """The command of a study's file."""
+    """The command of a study's file; it runs nothing where the named bases or controls are of another robot."""
+    from forgetmimic_jax.studies.policies import named_of_other_robots
+
     program = f"python -m experiments.{study.name}"
     given = tyro.cli(
         options,
@@ -78,4 +90,12 @@ def main(study: Study, options: type[Options] = Options, arguments: Iterable[str
         args=None if arguments is None else list(arguments),
         config=(tyro.conf.FlagCreatePairsOff,),
     )
-    run_command(lambda: conduct(study, given, "make experiments"))
+
+    def run() -> None:
+        others = [] if given.draw else named_of_other_robots(given)
+        if others:
+            print(f"{study.name}: skipped: it is of the {given.robot}, and {', '.join(others)}")
+            return
+        conduct(study, given, "make experiments")
+
+    run_command(run)

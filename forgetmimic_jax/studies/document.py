@@ -2,6 +2,10 @@
 
 {"schema", "study", "conditions": {...}, "made_by": [{"code", "commit", ..., "runs": [...]}], "failed": {trial: why},
 "results": {...}}; `conditions` is what the results answer, `made_by` says which code and machine made which runs.
+
+A run's `code` is the package's. The files in `experiments/` are no part of it: what they give a trial is in the trial's
+name and in `conditions`, and the rest asks and shows, so that a page can be mended without running its trials again.
+The `commit` beside it says which they were, with "+changes" where they were changed since.
 """
 
 from __future__ import annotations
@@ -76,6 +80,12 @@ def origin_of(trial: Path) -> dict[str, Any]:
         return said
     here, code = dataclasses.asdict(provenance()), trial.name.rpartition("-")[2]
     return here if code == here["code"] else {"code": code}
+
+
+def same_bases(document: Mapping[str, Any], conditions: Mapping[str, Any]) -> bool:
+    """Whether a stored run could stand beside a new one: the same policy is a base of both."""
+    before, now = ({base["policy"] for base in of["bases"]} for of in (document["conditions"], conditions))
+    return bool(before & now)
 
 
 def check_same_code(path: Path, document: Mapping[str, Any], *, mix: bool) -> None:

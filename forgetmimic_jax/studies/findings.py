@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from forgetmimic_jax.evaluation.repeats import over_repeats
-from forgetmimic_jax.evaluation.statistics import PlainEstimate
 from forgetmimic_jax.evaluation.tables import FORGOTTEN, percent
 from forgetmimic_jax.studies.claim import Finding, finding
-from forgetmimic_jax.studies.variants import estimates, gained, within
+from forgetmimic_jax.studies.variants import estimates, mean_gained, within
 
 SUCCESS = "success_rate"
 NONE = 0.05  # of the episodes: a success rate of at most this counts as none
@@ -40,14 +38,6 @@ def kept_stay(
         whose = "the control's" if other else "the base's"
         evidence = f"success on the kept clips minus {whose} {percent(change)}; bound {share(-POINTS)}"
         yield finding(claim, change, -POINTS, evidence, below=False, main=main)
-
-
-def mean_gained(
-    variants: Mapping[str, Any], label: str, other: str | None, group: str, metric: str
-) -> PlainEstimate | None:
-    """A variant's number minus another's of the same repeat, or minus the base's; None where none has both."""
-    found = gained(variants, label, other, group, metric)
-    return over_repeats(found) if found else None
 
 
 def share(value: float) -> str:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from forgetmimic_jax.basics.console import progress
 from forgetmimic_jax.basics.errors import InputError, Interrupted
+from forgetmimic_jax.basics.provenance import made_here
 from forgetmimic_jax.evaluation.repeats import Repeat
 from forgetmimic_jax.settings.config import Config, preset
 from forgetmimic_jax.settings.options import at_least, comma_separated, override, replace_given
@@ -25,37 +26,44 @@ if TYPE_CHECKING:
     from forgetmimic_jax.policy.policy import Policy
     from forgetmimic_jax.studies.trials import Trial
     from forgetmimic_jax.tracking.setup import Setup
+    from forgetmimic_jax.training.checkpoint import CheckpointInfo
 
 FOLDERS = ("base", "library")  # options that name a place on this machine
+SEEDS = 3  # of one base, or of a study without a base
 Key = tuple[str, Repeat]  # a run: its label, and from which base with which seed
 
 
 class Lab:
     """The options of a study, checked, and the runs that it has used."""
 
-    def __init__(self, options: Options, iterations: int, known: Mapping[str, Known] | None = None):
+    def __init__(
+        self, options: Options, iterations: int, known: Mapping[str, Known] | None = None, *, fresh: bool = False
+    ):
         """Check the options.
 
         Args:
             options: of the study.
             iterations: of each trial.
             known: what the JSON of studies says of trials, by the trial's name (`known_trials`).
+            fresh: the study trains fresh policies, so that its unit is the seed, however many bases there are.
         """
         from forgetmimic_jax.studies.policies import find_bases, find_controls
         from forgetmimic_jax.tracking.setup import check_targets, default_targets
 
-        for flag in ("seeds", "episodes", "jobs"):
+        for flag in ("episodes", "jobs"):
             at_least(1, f"--{flag}", getattr(options, flag))
         at_least(1, "--iterations", iterations)
         self.options, self.iterations = options, iterations
         self.bases = find_bases(options)
+        self.seeds = (1 if len(self.bases) > 1 and not fresh else SEEDS) if options.seeds is None else options.seeds
+        at_least(1, "--seeds", self.seeds)
         self.config: Config = replace_given(self.bases[0].config, library=options.library)
         self.targets = default_targets(self.config) if options.targets is None else comma_separated(options.targets)
         if not self.targets:
             raise InputError("--targets: no clip named; name at least one to forget, such as --targets punch,kick")
         check_targets(self.targets, self.bases[0].clips)
         self.controls = find_controls(options, self.targets, self.bases)
-        seeds = range(options.seeds)  # of all bases first, so that a study that is stopped has as many of each
+        seeds = range(self.seeds)  # of all bases first, so that a study that is stopped has as many of each
         self.repeats = tuple(Repeat(base, seed) for seed in seeds for base in range(len(self.bases)))
         self.failed: dict[str, str] = {}
         self.stopped: Interrupted | None = None
@@ -83,16 +91,14 @@ class Lab:
 
     def conditions(self) -> dict[str, Any]:
         """What the results answer."""
-        from forgetmimic_jax.training.checkpoint import policy_hash
-
         return {
             "robot": self.options.robot,
-            "bases": [{"policy": policy_hash(of), "environment_steps": of.environment_steps} for of in self.bases],
+            "bases": [_policy(base) for base in self.bases],
             "library": self.bases[0].library_hash,
             "targets": list(self.targets),
             "preset": self.options.preset,
             "iterations": self.iterations,
-            "seeds": self.options.seeds,
+            "seeds": self.seeds,
             "episodes": self.options.episodes,
             "set": list(itertools.chain(*self.options.set)),
             **({"physics": self.options.physics} if self.options.physics else {}),
@@ -100,10 +106,8 @@ class Lab:
 
     def control_conditions(self) -> dict[str, Any]:
         """Of a study that has the retrained control: which one."""
-        from forgetmimic_jax.training.checkpoint import policy_hash
-
         if self.controls:
-            return {"controls": [policy_hash(control) for control in self.controls]}
+            return {"controls": [_policy(control) for control in self.controls]}
         return {"control_iterations": self.control_iterations}
 
     def made_by(self) -> list[dict[str, Any]]:
@@ -263,7 +267,8 @@ class Lab:
         """Every policy on the same episodes, and the clips' names.
 
         Args:
-            policies: checkpoints by any key; None is the zero-action baseline.
+            policies: checkpoints by any key, which names a run where it is a label and a repeat; None is the
+                zero-action baseline.
             clips: other clips than the library's.
             episodes: a clip; the study's by default.
             seed: of the episodes.
@@ -281,6 +286,8 @@ class Lab:
             for done, (key, path) in enumerate(policies.items(), start=1):
                 rolled[key] = evaluator.rollout(self._policy(path, setup))
                 show(done, 0, {})
+        here = dataclasses.asdict(made_here())  # what no trial made was made here
+        self._origins = {run_name(*key): here for key in policies if isinstance(key, tuple)} | self._origins
         return rolled, library.names
 
     def unbounded(self, policies: Mapping[Any, Path | None]) -> dict[Any, dict[str, np.ndarray]]:
@@ -306,6 +313,13 @@ class Lab:
         from forgetmimic_jax.training import checkpoint
 
         return None if path is None else checkpoint.load_policy(checkpoint.read_info(path), setup.robot)
+
+
+def _policy(of: CheckpointInfo) -> dict[str, Any]:
+    """A base or a control in the JSON."""
+    from forgetmimic_jax.training.checkpoint import policy_hash
+
+    return {"policy": policy_hash(of), "environment_steps": of.environment_steps}
 
 
 def watched_episodes(episodes: int) -> int:

@@ -28,9 +28,9 @@ class Options:
     """PPO iterations of each trial; the preset's by default."""
     control_iterations: int | None = None
     """Iterations of a control that the study retrains; as many steps as the base was trained for by default."""
-    seeds: int = 3
-    """Runs of each kind from each base, with the seeds 0, 1, ...; the intervals are over the bases, or where there is
-    one base over its seeds."""
+    seeds: int | None = None
+    """Runs of each kind from each base, with the seeds 0, 1, ...; by default 1 with several bases, over which the
+    intervals are then, and 3 with one base, whose seeds they are over."""
     episodes: int = 20
     """Evaluation episodes a clip."""
     jobs: int = 2

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from forgetmimic_jax.studies.claim import corrected, findings_table
+from forgetmimic_jax.studies.claim import Finding, corrected, findings_table
 from forgetmimic_jax.studies.document import code_text
 from forgetmimic_jax.studies.lab import watched_episodes
 from forgetmimic_jax.studies.study import Study
@@ -16,24 +16,41 @@ LAPTOP = (
 )
 OVER_BASES = (
     "- In square brackets: the 95 % interval over the n bases (Student's t), where a base's number is the mean over "
-    "its seeds. The base is the unit; one base has no interval."
+    "its seeds. The base is the unit; one base has no interval. Where n counts seeds, the number is of one base alone: "
+    "its interval is over those seeds, says nothing of the other bases and decides nothing."
 )
 OVER_SEEDS = (
     "- In square brackets: the 95 % interval over the n seeds of one base (Student's t). The seed is the unit, and the "
     "interval does not say what other bases would give; one seed has no interval."
 )
+OVER_TRAININGS = (
+    "- In square brackets: the 95 % interval over the n seeds (Student's t), each of which is a whole training; one "
+    "seed has no interval."
+)
+WITHOUT_SPREAD = (
+    "- A spread of 0 is no certainty: the interval of a rate, or of a difference of two rates, is never narrower than "
+    "that of all its episodes together, and any other number that is the same in every unit has no interval and "
+    "decides nothing (*one value*)."
+)
 WORDS = (
     "A claim *holds* where the whole 95 % interval of its number is on the right side of the bound, *does not hold* "
     "where it is on the wrong side, and is *open* between. The words are corrected for the number of claims (Holm; the "
     "main claim and the further findings apart), so a claim may be open although its own interval clears the bound. "
-    "One run has no interval: its word only says to which side the number points."
+    "One run has no interval: its word only says to which side the number points. Where an interval spans its bound, "
+    "the number of units is told that would decide if mean and spread stayed as they are, before that correction."
 )
+
+
+def findings_of(study: Study, document: Mapping[str, Any]) -> list[Finding]:
+    """What a study's numbers say, with the words that remain after the corrections."""
+    bases = 1 if study.kind == "fresh" else len(document["conditions"]["bases"])
+    return corrected(study.findings(document), bases)
 
 
 def page(study: Study, document: Mapping[str, Any]) -> str:
     """The whole page."""
     lines = [
-        f"# {study.title} ({size(document)})",
+        f"# {study.title} ({size(study, document)})",
         "",
         f"{'Ours, not in the paper' if study.ours else 'The paper'}: {study.claim}",
         "",
@@ -42,7 +59,7 @@ def page(study: Study, document: Mapping[str, Any]) -> str:
         study.body(document),
         "## What it says of the claim",
         "",
-        findings_table(corrected(study.findings(document))),
+        findings_table(findings_of(study, document)),
         WORDS,
         "",
         f"![{study.title}]({study.name}.png)",
@@ -53,29 +70,39 @@ def page(study: Study, document: Mapping[str, Any]) -> str:
 
 def conditions(study: Study, document: Mapping[str, Any]) -> Iterator[str]:
     """What the numbers were made with, a list item each."""
-    conditions = document["conditions"]
-    variants = document["results"].get("variants", {}).values()
-    own_targets = any("targets" in variant["options"] for variant in variants)
-    targets = "" if own_targets else f"; targets: {', '.join(conditions['targets'])}"
+    conditions, several = document["conditions"], len(document["conditions"]["bases"]) > 1
+    yield f"- Robot {conditions['robot']}; {size(study, document)}; {_subject(study, document)}."
     episodes = watched_episodes(conditions["episodes"]) if study.watches else conditions["episodes"]
-    steps = " and ".join(dict.fromkeys(f"{base['environment_steps']:,}" for base in conditions["bases"]))
-    yield f"- Robot {conditions['robot']}; {size(document)}; bases trained for {steps} environment steps{targets}."
-    yield (
-        f"- {conditions['iterations']:,} iterations a run with the {conditions['preset']} preset, {episodes} episodes "
-        "a clip."
-    )
+    trained = f"{conditions['iterations']:,} iterations a run with the {conditions['preset']} preset, "
+    yield f"- {'' if study.kind == 'rollout' else trained}{episodes} episodes a clip."
     yield from origins(document)
-    if conditions["preset"] == "cpu":
+    if study.kind == "unlearn" and conditions["preset"] == "cpu":
         yield LAPTOP
-    yield OVER_BASES if len(conditions["bases"]) > 1 else OVER_SEEDS
+    yield OVER_TRAININGS if study.kind == "fresh" else OVER_BASES if several else OVER_SEEDS
+    yield WITHOUT_SPREAD
     for name, reason in document["failed"].items():
         yield f"- Failed: `{name}`: {reason}"
 
 
-def size(document: Mapping[str, Any]) -> str:
+def _subject(study: Study, document: Mapping[str, Any]) -> str:
+    """What the runs start from, and what they forget where that is one thing."""
+    conditions = document["conditions"]
+    if study.kind == "fresh":
+        return "fresh policies, trained on all clips"
+    steps = " and ".join(dict.fromkeys(f"{base['environment_steps']:,}" for base in conditions["bases"]))
+    bases = f"bases trained for {steps} environment steps"
+    if study.kind == "rollout":
+        return f"{bases}, which are not trained further"
+    variants = document["results"].get("variants", {}).values()
+    own_targets = study.own_targets or any("targets" in variant["options"] for variant in variants)
+    return bases if own_targets else f"{bases}; targets: {', '.join(conditions['targets'])}"
+
+
+def size(study: Study, document: Mapping[str, Any]) -> str:
     """How many bases a study has, and how many runs of each kind from each of them."""
     bases, seeds = len(document["conditions"]["bases"]), document["conditions"]["seeds"]
-    return f"{bases} base{'s' * (bases > 1)} × {seeds} seed{'s' * (seeds > 1)}"
+    of_base, of_seed = f"{bases} base{'s' * (bases > 1)}", f"{seeds} seed{'s' * (seeds > 1)}"
+    return {"unlearn": f"{of_base} × {of_seed}", "fresh": of_seed, "rollout": of_base}[study.kind]
 
 
 def origins(document: Mapping[str, Any]) -> Iterator[str]:

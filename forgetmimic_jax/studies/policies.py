@@ -63,10 +63,26 @@ def find_controls(
     return infos
 
 
+def named_of_other_robots(options: Options) -> list[str]:
+    """In words, which flags name policies of another robot than the study's."""
+    from forgetmimic_jax.training.checkpoint import read_info
+
+    found = []
+    for flag, names in (("--bases", options.bases), ("--controls", options.controls)):
+        robots = {read_info(Path(name)).robot for name in comma_separated(names or "")} - {options.robot}
+        if robots:
+            found.append(f"{flag} names policies of the {' and '.join(sorted(robots))}")
+    return found
+
+
 def retrained_in_words(conditions: Mapping[str, Any]) -> str:
     """How the retrained policies of a study were made, for its page."""
     if "controls" in conditions:
-        return "The retrained policies are controls of `make pretrain WITHOUT=TARGETS`, trained as a base is."
+        steps = " and ".join(dict.fromkeys(f"{of['environment_steps']:,}" for of in conditions["controls"]))
+        return (
+            "The retrained policies are controls of `make pretrain WITHOUT=TARGETS`, trained as a base is, for "
+            f"{steps} environment steps."
+        )
     return (
         f"The retrained policy was trained for {conditions['control_iterations']:,} iterations; a short training makes "
         "it a reference for the first steps only."

@@ -35,7 +35,7 @@ def sampler_study(samplers: tuple[str, ...] = SAMPLERS) -> Study:
         "Adaptive sampling and the wrench resist forgetting and cost the kept clips.",
         lambda lab: ablation(samplers),
         findings=lambda document: findings(document["results"]["variants"], main=True),
-        theirs=paper.ABLATION,
+        papers=paper.ABLATION,
         conditions=lambda lab: conditions,
     )
 

@@ -21,7 +21,7 @@ def seeds_study(_: tuple[str, ...] = ()) -> Study:
         lambda lab: {LABEL: {}},
         findings=findings,
         answer=lambda document: forgotten_and_kept(document["results"]["variants"]),
-        theirs=paper.VALIDITY,
+        papers=paper.VALIDITY,
     )
 
 

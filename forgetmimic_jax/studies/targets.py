@@ -31,7 +31,8 @@ def targets_study(
     name: str = "targets",
     title: str = "Does it matter which motions are to be forgotten?",
     claim: str = "Combat, dance and locomotion can be forgotten, and the other clips are kept.",
-    theirs: Mapping[str, Any] | None = None,
+    papers: Mapping[str, Any] | None = None,
+    theirs: str = "",
 ) -> Study:
     """The default run with each group of targets; the paper's numbers beside it where it has them."""
 
@@ -49,7 +50,8 @@ def targets_study(
         title,
         claim,
         variants,
-        theirs=theirs or {},
+        papers=papers or {},
+        theirs=theirs,
         conditions=lambda lab: conditions,
         draw=draw,
         findings=findings,

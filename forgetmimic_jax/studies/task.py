@@ -21,6 +21,7 @@ from forgetmimic_jax.basics.drawing import draw_later
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.basics.files import read_rows, write_atomically
 from forgetmimic_jax.basics.provenance import PACKAGE, provenance
+from forgetmimic_jax.studies.process import CODE
 
 ATTEMPTS = 3  # at a task whose process the system kills
 POLL = 1.0  # s between two questions whether a running task is still wanted
@@ -209,9 +210,10 @@ def _start(task: Task, directory: Path, threads: int) -> subprocess.Popen | None
 
 
 def _environment(threads: int) -> dict[str, str]:
-    """For the process of a task: the code of this process, and how many threads it may use."""
+    """For the process of a task: where the code of this process lies, its hash, and how many threads it may use."""
     paths = [str(PACKAGE.parent), *filter(None, [os.environ.get("PYTHONPATH")])]
     counts = dict.fromkeys(THREADS, str(threads))
+    counts[CODE] = provenance().code
     return counts | {"PYTHONPATH": os.pathsep.join(paths), "PYTHONSAFEPATH": "1"}
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from forgetmimic_jax.basics.provenance import provenance
+from forgetmimic_jax.evaluation.document import FILE
 from forgetmimic_jax.motion.library import library_hash
 from forgetmimic_jax.robot.model import roles_file
 from forgetmimic_jax.settings.config import Config, to_dict
@@ -52,8 +53,15 @@ class Trial:
 
     @property
     def finished(self) -> bool:
-        """It was trained and evaluated."""
-        return self.task.finished
+        """It was trained and evaluated, by the code that its name says."""
+        return self.task.finished and not self.other_code
+
+    @property
+    def other_code(self) -> set[str]:
+        """Codes that made the evaluation or a checkpoint of the folder, and are not the one that its name says."""
+        notes = [self.folder / FILE, *self.folder.glob(f"checkpoints/*/{checkpoint.META}")]
+        made = [json.loads(note.read_text()).get("made") or {} for note in notes if note.is_file()]
+        return {of["code"] for of in made if "code" in of} - {self.folder.name.rpartition("-")[2]}
 
 
 def make_trial(root: Path, options: Mapping[str, Any]) -> Trial:
@@ -61,11 +69,11 @@ def make_trial(root: Path, options: Mapping[str, Any]) -> Trial:
 
     Its folder is METHOD-TARGETS-sSEED-DIGEST-CODE in `root`. DIGEST is over every setting, the number of evaluation
     episodes, and the contents of base, clips and robot; CODE is over the package's Python files. Where base and clips
-    lie does not count.
+    lie, and who wrote them down when, does not count.
     """
     given = Options(**{**options, "set": [list(options.get("set", []))]})
     config = config_of(given)
-    base = checkpoint.fingerprint(base_checkpoint(config))
+    base = _content(checkpoint.read_info(base_checkpoint(config)))
     robot = [path.read_text() for path in sorted(roles_file(config.robot).parent.glob("*.*ml"))]
     plain = dataclasses.replace(config, base=None, library=None)
     content = [to_dict(plain), given.episodes, base, library_hash(library_folder(config)), robot]
@@ -77,11 +85,16 @@ def control_trial(
     root: Path, control: CheckpointInfo, base: CheckpointInfo, *, episodes: int, seed: int, physics: str | None
 ) -> Trial:
     """The evaluation of a retrained control beside a base, named as in `make_trial`."""
-    config, both = control.config, [checkpoint.fingerprint(info.path) for info in (control, base)]
+    config, both = control.config, [_content(info) for info in (control, base)]
     folder = _folder(root, "control", config.unlearn.targets, seed, [*both, control.library_hash, episodes, physics])
     flags = ["--robot", config.robot, "--checkpoint", str(control.path), "--base", str(base.path)]
     flags += ["--episodes", str(episodes), "--seed", str(seed), *(["--physics", physics] if physics else [])]
     return Trial(folder, config, tuple(flags), "evaluate")
+
+
+def _content(info: CheckpointInfo) -> list[Any]:
+    """Policy and settings of a checkpoint: the same for a copy that another commit or machine has written."""
+    return [checkpoint.policy_hash(info), to_dict(dataclasses.replace(info.config, base=None, library=None))]
 
 
 def _folder(root: Path, kind: str, targets: Sequence[str], seed: int, content: Any) -> Path:
@@ -95,7 +108,16 @@ def without_code(name: str) -> str:
 
 
 def run_trials(trials: Sequence[Trial], *, jobs: int, cluster: str | None, description: str) -> dict[Trial, str]:
-    """`run_tasks` of the trials that are not finished; returns those that failed, each with its reason."""
-    tasks = {trial: trial.task for trial in trials}
+    """`run_tasks` of the trials that are not finished; returns those that failed, each with its reason.
+
+    A trial that other code made a part of has failed, too: one number would be of two codes.
+    """
+    tasks = {trial: trial.task for trial in trials if not trial.other_code}
     failed = run_tasks(list(tasks.values()), jobs=jobs, cluster=cluster, description=description)
-    return {trial: failed[task] for trial, task in tasks.items() if task in failed}
+    reasons = {trial: failed[task] for trial, task in tasks.items() if task in failed}
+    return reasons | {trial: _mixed(trial) for trial in trials if trial.other_code}
+
+
+def _mixed(trial: Trial) -> str:
+    codes = " and ".join(sorted(trial.other_code))
+    return f"code {codes} made a part of it, as the checkout changed meanwhile; remove {trial.folder} to run it again"

@@ -12,11 +12,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from forgetmimic_jax.basics.files import read_rows
-from forgetmimic_jax.evaluation import statistics
 from forgetmimic_jax.evaluation.document import FILE, Estimate, GroupResult, UnboundedNumbers, read_evaluation
 from forgetmimic_jax.evaluation.metrics import BASE, COMMON, LOWEST_CONTENT, ZERO_ACTION
 from forgetmimic_jax.evaluation.plots import bars, new_figure
-from forgetmimic_jax.evaluation.repeats import over_repeats
+from forgetmimic_jax.evaluation.repeats import (
+    difference_over_repeats,
+    over_repeats,
+    rate_over_repeats,
+    units,
+)
+from forgetmimic_jax.evaluation.statistics import PlainEstimate
 from forgetmimic_jax.evaluation.tables import markdown_table, number, percent
 
 if TYPE_CHECKING:
@@ -26,8 +31,9 @@ TRACKING = "survival_weighted_tracking"
 DEVIATION = f"max_key_body_position_error{COMMON}"  # m
 METRICS = ("success_rate", TRACKING, "tracking_reward", "episode_length", "skill", "retention", DEVIATION)
 UNBOUNDED = ("upright_rate", "impact_rate", "motion_content")  # of targets, in episodes that no termination ends
-EPISODES = "episodes"  # of the group, behind its success rate
-RATIOS = ("degradation_ratio", "survival_weighted_degradation_ratio")
+EPISODES = "episodes"  # of the group, behind its rates
+RATES = ("success_rate", "upright_rate", "impact_rate", "tpr_at_5_percent_fpr")  # shares of episodes
+DEGRADATION = ("degradation_ratio", "survival_weighted_degradation_ratio")
 
 HEADER = ("n", "success", "tracking", "while alive", "steps", "skill retained")
 UNBOUNDED_HEADER = ("upright", "impact", "content")
@@ -42,7 +48,6 @@ NOTES = (
     "self-collision. Upright: share of episodes without a fall; impact: share with a force of the floor above one body "
     "weight on a body that is no foot; content: share of the clip's own movement that is reproduced, 0 for a robot "
     "that stands. An empty cell: not measured.",
-    "a success rate that is the same in every run has the exact interval of all episodes together.",
 )
 THEIRS = "Rows of the paper: another library of clips, another base and another budget."
 
@@ -60,7 +65,7 @@ def summary(folder: Path) -> dict[str, Any]:
         result[name if name in (BASE, ZERO_ACTION) else "policy"] = {
             **{group: _numbers(numbers) for group, numbers in groups.items() if numbers},
             "clips": {clip: numbers.survival_weighted_tracking.mean for clip, numbers in policy.clips.items()},
-            **_means({ratio: getattr(policy, ratio) for ratio in RATIOS}),
+            **_means({ratio: getattr(policy, ratio) for ratio in DEGRADATION}),
         }
     rows = read_rows(folder / "metrics.jsonl")
     if rows and "target/lambda_crit" in rows[0]:
@@ -103,6 +108,25 @@ def paired(
     return {repeat: (mine[repeat], theirs[repeat]) for repeat in mine if repeat in theirs}
 
 
+def mean_gained(
+    variants: Mapping[str, Any], label: str, other: str | None, group: str, metric: str
+) -> PlainEstimate | None:
+    """A variant's number minus another's of the same repeat, or minus the base's; None where none has both."""
+    pairs = paired(variants, label, other, group, metric)
+    return difference(variants[label]["runs"], pairs, group, metric) if pairs else None
+
+
+def difference(
+    runs: Mapping[str, Any], pairs: Mapping[str, tuple[float, float]], group: str, metric: str
+) -> PlainEstimate:
+    """The mean difference of the pairs of a metric, by repeat; for RATES over the episodes of the runs' group."""
+    if metric not in RATES:
+        return over_repeats({repeat: one - other for repeat, (one, other) in pairs.items()})
+    counted = {repeat: run["policy"][group] for repeat, run in runs.items()}
+    episodes = {repeat: of[EPISODES] for repeat, of in counted.items() if EPISODES in of}
+    return difference_over_repeats(pairs, episodes)
+
+
 def _numbers(group: GroupResult) -> dict[str, float]:
     unbounded = group.unbounded.all_starts if group.unbounded else UnboundedNumbers()
     found = {name: group.metric(name) for name in METRICS} | {name: getattr(unbounded, name) for name in UNBOUNDED}
@@ -116,18 +140,16 @@ def _means(numbers: Mapping[str, Estimate | None]) -> dict[str, float]:
 def estimates_of(runs: Mapping[str, Any]) -> Any:
     """Nested numbers, one tree a repeat, as one tree of estimates; a number that only some runs have is over those.
 
-    A success rate that is the same in every run gets the exact interval of their episodes together.
+    A number of RATES beside a number of episodes is a rate over so many.
     """
     if not isinstance(next(iter(runs.values())), Mapping):
         return over_repeats(runs)
     names = dict.fromkeys(name for run in runs.values() for name in run)
-    result = {name: estimates_of({repeat: run[name] for repeat, run in runs.items() if name in run}) for name in names}
-    if EPISODES in result and result["success_rate"].get("std", 1.0) < 1e-9:
-        # No spread to learn from, as where all fail.
-        episodes = sum(run[EPISODES] for run in runs.values())
-        pooled = statistics.rate(round(result["success_rate"]["mean"] * episodes), episodes)
-        result["success_rate"] |= {"low": pooled["low"], "high": pooled["high"], "episodes": episodes}
-    return result
+    by_name = {name: {repeat: run[name] for repeat, run in runs.items() if name in run} for name in names}
+    episodes = by_name.get(EPISODES, {})
+    return {
+        name: rate_over_repeats(of, episodes) if name in RATES else estimates_of(of) for name, of in by_name.items()
+    }
 
 
 def variant_table(variants: Mapping[str, Any], theirs: Mapping[str, Any]) -> str:
@@ -152,7 +174,7 @@ def variant_table(variants: Mapping[str, Any], theirs: Mapping[str, Any]) -> str
         [
             label,
             *_cells(policy.get("kept", {})),
-            *(number(within(policy.get(ratio), 0.0, np.inf), 2) for ratio in RATIOS),
+            *(number(within(policy.get(ratio), 0.0, np.inf), 2) for ratio in DEGRADATION),
         ]
         for label, policy in policies.items()
     ]
@@ -166,9 +188,9 @@ def variant_table(variants: Mapping[str, Any], theirs: Mapping[str, Any]) -> str
 
 def _cells(group: Mapping[str, Any]) -> list[str]:
     success, tracking, alive = (within(group.get(metric), 0.0, 1.0) for metric in METRICS[:3])
-    n = next((estimate["n"] for estimate in group.values() if estimate["n"]), "")
+    n = next((units(estimate) for estimate in group.values() if estimate["n"]), "")
     steps = number(within(group.get("episode_length"), 0.0, np.inf), 0)
-    return [str(n), percent(success), number(tracking, 2), number(alive, 2), steps, percent(group.get("skill"))]
+    return [n, percent(success), number(tracking, 2), number(alive, 2), steps, percent(group.get("skill"))]
 
 
 def _unbounded_cells(group: Mapping[str, Any]) -> list[str]:

@@ -164,6 +164,25 @@ def test_a_further_seed_that_fails_leaves_the_others_and_is_told(swept, base_run
     assert list(document["failed"].values()) == ["no luck"]
 
 
+def test_runs_of_other_bases_are_replaced_after_a_line(swept, base_run, monkeypatch, tmp_path):
+    text = (swept[0] / "out" / "seeds.json").read_text().replace(provenance().code, "0123abcd")
+    policy = policy_hash(read_info(base_run.checkpoint(4)))
+    (tmp_path / "seeds.json").write_text(text.replace(policy, "f" * 16))
+    monkeypatch.setattr(executor, "on_this_machine", None)
+    wanted = options(sweep.Options, base_run, swept[0], kind="seeds", output=tmp_path)
+    run = finished(sweep.main, wanted)
+    assert "seeds.json: its runs are of other bases, so the new ones replace them" in run.printed.replace("\n", "")
+    document = json.loads((tmp_path / "seeds.json").read_text())
+    assert [group["code"] for group in document["made_by"]] == [provenance().code]
+
+
+def test_policies_of_another_robot_skip_a_study_with_a_line(base_run, capsys):
+    study = importlib.import_module("experiments.number_of_targets")
+    conduct.main(study.STUDY, study.H2Options, ["--bases", str(base_run.checkpoint(4))])
+    expected = "number_of_targets: skipped: it is of the h2, and --bases names policies of the g1\n"
+    assert capsys.readouterr().out == expected
+
+
 OTHER = dataclasses.replace(provenance(), code="0123abcd", commit="f" * 40)
 
 
@@ -340,7 +359,7 @@ def test_help_lists_what_a_study_takes(capsys):
             command()
         assert exit_.value.code == 0
         text = capsys.readouterr().out
-        for flag in ("--preset {cpu,paper}", "--mix-commits", "--seeds INT", "--jobs INT", "--draw", "(default: 3)"):
+        for flag in ("--preset {cpu,paper}", "--mix-commits", "--seeds {None}|INT", "--jobs INT", "--draw"):
             assert flag in text
 
 
@@ -410,7 +429,7 @@ def test_every_study_comes_to_its_page_and_figure(name, base_run, watched_run, t
     assert sorted(path.suffix for path in out.glob(f"{name}.*")) == [".json", ".md", ".png"]
     assert asked_for
     page = (out / f"{name}.md").read_text()
-    assert page.startswith(f"# {subject.title} (1 base × 2 seeds)\n")
+    assert page.startswith(f"# {subject.title} ({'2 seeds' if name == 'from_scratch' else '1 base × 2 seeds'})\n")
     assert "nan" not in page
     assert run.printed
 
@@ -451,6 +470,9 @@ def test_generality_rolls_the_bases_out_on_clips_that_they_never_saw(base_run, l
     page = (tmp_path / "out" / "generality.md").read_text()
     assert "\nOurs, not in the paper: A base completes most episodes of the mirror images of its clips" in page
     assert "\n| mirror images | 3 | " in page
+    assert page.startswith("# What does a base know beyond its clips? (1 base)\n")
+    assert "\n- 2 episodes a clip.\n- Made by code " in page
+    assert "KL" not in page
 
 
 @pytest.fixture
@@ -465,7 +487,7 @@ def control(base_run, tmp_path) -> Path:
 def test_a_control_stands_for_the_retrained_policy_and_is_evaluated_beside_its_base(base_run, control, tmp_path):
     of = Lab(options(StudyOptions, base_run, tmp_path, controls=str(control)), iterations=2)
     policy = policy_hash(read_info(control))
-    assert of.control_conditions() == {"controls": [policy]}
+    assert of.control_conditions() == {"controls": [{"policy": policy, "environment_steps": 128}]}
     assert of.retrained == {Repeat(0, 0): {"control": True}}
     trial = of.trial({"control": True}, Repeat(0, 0))
     assert (trial.command, trial.task.iterations) == ("evaluate", 0)

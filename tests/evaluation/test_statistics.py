@@ -87,3 +87,18 @@ def test_over_seeds_is_students_t():
     low, high = stats.t.interval(0.95, 2, loc=np.mean(values), scale=stats.sem(values))
     assert (found["low"], found["high"]) == pytest.approx((low, high))
     assert statistics.over_seeds([0.5]) == {"mean": 0.5, "n": 1}
+
+
+@pytest.mark.parametrize(
+    ("std", "distance", "needed"),
+    [
+        # t(0.975, n - 1) / sqrt(n): 2.484 with 3, 1.591 with 4, 1.049 with 6 and 0.925 with 7
+        *((1.0, 2.0, 4), (1.0, 1.0, 7), (0.5, 0.5, 7), (0.0, 1.0, 2)),
+        # 12.706 / sqrt(2) = 8.985
+        *((1.0, 9.0, 2), (1.0, 8.9, 3)),
+        # 1.984 / 10 = 0.1984 with 100
+        *((1.0, 0.199, 100), (1.0, 0.198, None), (1.0, 0.0, None)),
+    ],
+)
+def test_the_units_that_would_decide(std, distance, needed):
+    assert statistics.units_needed(std, distance) == needed

@@ -2,15 +2,15 @@
 
 from experiments import claims
 from forgetmimic_jax.evaluation.repeats import Repeat
-from forgetmimic_jax.studies.claim import answer, corrected
+from forgetmimic_jax.studies.claim import answer
 from forgetmimic_jax.studies.conduct import RESULTS
 from forgetmimic_jax.studies.document import read_document, write_document
-from forgetmimic_jax.studies.page import page
+from forgetmimic_jax.studies.page import findings_of, page
 
 
 def test_each_study_is_a_row_and_one_that_is_not_measured_is_named(tmp_path):
     def group(success: float, skill: float) -> dict:
-        return {"success_rate": success, "survival_weighted_tracking": success, "skill": skill, "episodes": 40}
+        return {"success_rate": success, "survival_weighted_tracking": success, "skill": skill, "episodes": 4000}
 
     runs = {
         str(Repeat(0, seed)): {
@@ -25,11 +25,12 @@ def test_each_study_is_a_row_and_one_that_is_not_measured_is_named(tmp_path):
     write_document(tmp_path / "g1" / "validity.json", document)
     text = claims.table(tmp_path)
     header, _, row = text.splitlines()[:3]
-    assert header == "| the paper's claim | here | what was measured | runs of each kind | study |"
+    assert header == "| the paper's claim | here | what was measured | the paper's number | runs of each kind | study |"
     assert row == (
-        "| With λ = 16 the targets are forgotten and the other clips are kept. | **holds** | With λ = 16, 0 % [0, 3] "
+        "| With λ = 16 the targets are forgotten and the other clips are kept. | **holds** | With λ = 16, 0 % [0, 0] "
         "of the target episodes succeed, 11 % [9, 13] of the skill is retained, and the success rate on the other "
-        "clips changes by 0 % [0, 0] against the base. | 1 base × 3 seeds | [validity](results/g1/validity.md) |"
+        "clips changes by 0 % [-1, 1] against the base. | 0 % of the target episodes succeed; kept success from 74 to "
+        "68 % in its table, above 85 % in its text | 1 base × 3 seeds | [validity](results/g1/validity.md) |"
     )
     assert "Not measured yet: g1/comparison, g1/penalty," in text
 
@@ -52,4 +53,5 @@ def test_the_stored_pages_are_those_of_the_stored_numbers_and_say_what_made_them
         text = (RESULTS / f"{name}.md").read_text()
         assert page(study, document) == text, "run `make tables`"
         assert "\n- Made by " in text
-        assert answer(study.claim, corrected(study.findings(document))).n == 3
+        found = answer(study.claim, findings_of(study, document))
+        assert found.n == 3 or found.word == "not measured"

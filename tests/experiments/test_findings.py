@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 
 from experiments import (
@@ -18,7 +19,7 @@ from forgetmimic_jax.evaluation.relearning import Lasted
 from forgetmimic_jax.evaluation.repeats import Repeat
 from forgetmimic_jax.evaluation.statistics import over_seeds
 from forgetmimic_jax.evaluation.verdict import sooner_than_control
-from forgetmimic_jax.studies import penalty, samplers, targets
+from forgetmimic_jax.studies import claim, penalty, samplers, targets
 from forgetmimic_jax.studies.findings import mean_gained
 from forgetmimic_jax.studies.variants import DEVIATION
 
@@ -29,7 +30,7 @@ def variant(target: list[float], kept: list[float], base: float = 0.6, skill: li
     """As a study's JSON has it, a seed each of one base."""
 
     def group(value: float) -> dict:
-        return {"success_rate": value, "survival_weighted_tracking": value, "episodes": 40}
+        return {"success_rate": value, "survival_weighted_tracking": value, "episodes": 4000}
 
     runs = {
         str(Repeat(0, seed)): {
@@ -51,7 +52,7 @@ def test_differences_are_between_runs_of_the_same_repeat():
     found = {"a": variant([0.0, 0.1], [0.5, 0.7]), "b": variant([0.1], [0.45])}
     assert mean_gained(found, "a", None, "kept", "success_rate")["mean"] == pytest.approx(0.0)
     only = mean_gained(found, "a", "b", "kept", "success_rate")
-    assert only == {"mean": pytest.approx(0.05), "n": 1}
+    assert only == {"mean": pytest.approx(0.05), "n": 1, "unit": "seed"}
     assert mean_gained(found, "a", "c", "kept", "success_rate") is None
 
 
@@ -89,8 +90,9 @@ def test_the_default_run_is_compared_with_its_control_the_ratio_and_zero_actions
         "largest key body error minus the zero-action baseline's 0.045 [0.033, 0.057] m, of 0.050 m, on the steps"
     )
     assert validity.answer(document) == (
-        f"With {label}, 0 % [0, 3] of the target episodes succeed, -11 % [-13, -9] of the skill is retained (below 0: "
-        "worse than with zero actions), and the success rate on the other clips changes by 0 % [0, 0] against the base."
+        f"With {label}, 0 % [0, 0] of the target episodes succeed, -11 % [-13, -9] of the skill is retained (below 0: "
+        "worse than with zero actions), and the success rate on the other clips changes by 0 % [-1, 1] against the "
+        "base."
     )
 
 
@@ -128,9 +130,11 @@ def test_the_comparison_by_hand():
     assert "0.29 [0.27, 0.31] (negated reward); -0.11 [-0.13, -0.09] (decremental)" in comparison.answer(document)
     pairs = [(f"{prefix}adaptive{more}", f"{prefix}uniform clips{more}") for more in ("", ", wrench")]
     by_hand = [(0.2 + 0.1) / 2, (0.1 + 0.3) / 2, (0.0 + 0.4) / 2]
-    assert samplers.effect(found, pairs, "target") == pytest.approx(over_seeds(by_hand))
+    effect = samplers.effect(found, pairs, "target")
+    assert effect.pop("unit") == "seed"
+    assert effect == pytest.approx(over_seeds(by_hand))
     found[f"{prefix}uniform clips"] = variant([0.2], [0.6])
-    assert samplers.effect(found, pairs, "target") == {"mean": pytest.approx(0.15), "n": 1}
+    assert samplers.effect(found, pairs, "target") == {"mean": pytest.approx(0.15), "n": 1, "unit": "seed"}
 
 
 def test_a_policy_that_falls_sooner_than_with_zero_actions_does_not_only_lack_a_skill():
@@ -157,14 +161,30 @@ def test_a_policy_that_falls_sooner_than_with_zero_actions_does_not_only_lack_a_
         *(("holds", True), ("does not hold", True), ("holds", False), ("open", False))
     ]
     assert found[1].evidence == (
-        "max key body position error, common steps 0.210 [0.185, 0.235]; bound 0.120, the zero action's"
+        "max key body position error, common steps minus the zero action's 0.090 [0.065, 0.115]; bound 0"
     )
-    assert found[2].evidence == "foot contact 0.410 [0.385, 0.435]; bound 0.600, the base's"
+    assert found[2].evidence == "foot contact minus the base's -0.190 [-0.215, -0.165]; bound 0"
+    # With three bases each run is compared with its own: 0.40 - 0.45, 0.41 - 0.60 and 0.42 - 0.45. The zero-action
+    # baseline has no base: 0.20 - 0.12, 0.21 - 0.12 and 0.22 - 0.12.
+    runs = policies["λ = 16"].values()
+    policies["λ = 16"] = {str(Repeat(base, 0)): run for base, run in enumerate(runs)}
+    first = policies["base"]["base 0, seed 0"]
+    policies["base"] = {
+        str(Repeat(base, 0)): {**first, "foot_contact": [contact]} for base, contact in enumerate((0.45, 0.60, 0.45))
+    }
+    feet = physical_behaviour.minus(policies, "λ = 16", "base", "foot_contact")
+    assert (feet["mean"], feet["n"], feet["unit"]) == (pytest.approx(-0.09), 3, "base")
+    assert feet["std"] == pytest.approx(np.std([-0.05, -0.19, -0.03], ddof=1))
+    assert physical_behaviour.minus(policies, "λ = 16", "zero action", DEVIATION)["mean"] == pytest.approx(0.09)
 
 
 def test_the_training_curves_are_compared_with_what_the_paper_reads_off_them():
     def rows(first: dict[str, list[float]], last: dict[str, list[float]]) -> dict:
-        return {"rows": [{name: over_seeds(values) for name, values in at.items()} for at in (first, last)]}
+        runs = {
+            repeat: [{name: of[seed] for name, of in at.items()} for at in (first, last)]
+            for seed, repeat in enumerate(REPEATS[: len(first["entropy"])])
+        }
+        return {"iterations": [1, 200], "runs": runs}
 
     def found(of: dict) -> list[str]:
         return [one.word for one in training_dynamics.findings({"results": {"configurations": of}})]
@@ -183,14 +203,14 @@ def test_the_training_curves_are_compared_with_what_the_paper_reads_off_them():
     ]
 
 
-def test_two_intervals_differ_by_no_more_than_both_say():
-    last, first = over_seeds([4.0, 5.0, 6.0]), over_seeds([1.0, 2.0, 3.0])
-    found = training_dynamics.difference(last, first)
-    half = 4.302652729911275 * 1.0 / 3**0.5  # Student's t of two degrees of freedom
-    assert found == {
-        **{"mean": 3.0, "n": 3, "std": 2.0},  # a standard deviation of 2 gives the same interval
-        **{"low": pytest.approx(3 - 2 * half), "high": pytest.approx(3 + 2 * half)},
+def test_training_curves_are_compared_run_by_run_and_not_where_only_means_are_stored():
+    runs = {
+        "base 0, seed 0": [{"entropy": 5.0}, {"entropy": 4.0}],
+        "base 0, seed 1": [{"entropy": 9.0}, {"entropy": 7.0}],
     }
+    assert training_dynamics.risen({"runs": runs}, "entropy")["mean"] == -1.5
+    assert training_dynamics.risen({"runs": runs}, "entropy", 0.2)["mean"] == pytest.approx(0.5 * (3.0 + 5.2))
+    assert training_dynamics.risen({"rows": [{}, {}]}, "entropy") is None
 
 
 def swept(skills: dict[float, list[float]]) -> dict:
@@ -213,13 +233,13 @@ def swept(skills: dict[float, list[float]]) -> dict:
         # 4 x 2^(0.4 / 0.8), 4 x 2^(0.4 / 0.78) and 4 x 2^(0.4 / 0.79)
         ({4.0: [0.9, 0.9, 0.9], 8.0: [0.1, 0.12, 0.11]}, "holds", "5.7 [5.6, 5.7]"),
         # 8 x 2^(0.4 / 0.8)
-        ({8.0: [0.9, 0.9, 0.9], 16.0: [0.1, 0.1, 0.1]}, "does not hold", "11.3 [11.3, 11.3]"),
+        ({8.0: [0.9, 0.9, 0.9], 16.0: [0.1, 0.1, 0.1]}, "one value", "11.3"),
         # the second seed's half is gone below 4: 5.7, at most 4 and 5.7 are below 8 in the mean, [2.7, 7.5]
         ({4.0: [0.9, 0.3, 0.9], 8.0: [0.1, 0.05, 0.1]}, "holds", "5.7, below 4, 5.7 (run by run)"),
-        ({4.0: [0.3, 0.3, 0.3], 8.0: [0.1, 0.1, 0.1]}, "holds", "below 4, below 4, below 4 (run by run)"),
+        ({4.0: [0.3, 0.3, 0.3], 8.0: [0.1, 0.1, 0.1]}, "open", "below 4, below 4, below 4 (run by run)"),
         # one seed needs more than was tried
         ({4.0: [0.9, 0.9, 0.9], 8.0: [0.1, 0.1, 0.9]}, "open", "5.7, 5.7, above 8 (run by run)"),
-        ({4.0: [0.9, 0.9, 0.9], 16.0: [0.9, 0.9, 0.9]}, "does not hold", "above 16, above 16, above 16 (run by run)"),
+        ({4.0: [0.9, 0.9, 0.9], 16.0: [0.9, 0.9, 0.9]}, "open", "above 16, above 16, above 16 (run by run)"),
         # below the smallest says nothing of a bound that is smaller still
         ({12.0: [0.3, 0.3, 0.3], 16.0: [0.1, 0.1, 0.1]}, "open", "below 12, below 12, below 12 (run by run)"),
         ({4.0: [0.3, 0.9, 0.9], 16.0: [0.1, 0.9, 0.9]}, "open", "below 4, above 16, above 16 (run by run)"),
@@ -246,14 +266,31 @@ def test_half_of_the_skill_is_gone_between_two_penalties_before_the_first_or_aft
 
 
 def test_wear_is_what_the_kept_clips_lose_of_their_start():
-    def found(end: list[float]):
-        groups = [{"kept": {"survival_weighted_tracking": over_seeds(of)}} for of in ([0.8, 0.8, 0.8], [0.1] * 3, end)]
-        (one,) = heat_map.findings({"conditions": {"iterations": 1000}, "results": {"groups": groups}})
+    def found(end: list[float], start: tuple[float, ...] = (0.8, 0.8, 0.8)):
+        runs = {
+            repeat: [{"run": {name: value for name in heat_map.SHOWN}} for value in (start[seed], 0.1, end[seed])]
+            for seed, repeat in enumerate(REPEATS)
+        }
+        for run in runs.values():
+            for at in run:
+                at["kick"] = dict.fromkeys(heat_map.SHOWN, 0.3)
+        document = {
+            "conditions": {"iterations": 1000, "targets": ["kick"]},
+            "results": {"iterations": [0, 500, 1000], "runs": runs},
+        }
+        (one,) = heat_map.findings(document)
         return one
 
     assert found([0.78, 0.79, 0.80]).word == "holds"
     assert found([0.5, 0.51, 0.52]).word == "does not hold"
     assert found([0.7, 0.8, 0.75]).word == "open"
+    # Every run is compared with its own start: 0.3 - 0.285, 0.61 - 0.57 and 0.88 - 0.855.
+    paired = found([0.30, 0.61, 0.88], start=(0.3, 0.6, 0.9))
+    assert (
+        paired.evidence
+        == "kept tracking at the end minus 95 % of that at the start 0.027 [-0.005, 0.058]; bound 0"
+        + ("; with this mean and spread 4 seeds would decide")
+    )
     assert found([0.7, 0.8, 0.75]).claim == "the kept clips are not worn down after 1,000 iterations"
 
 
@@ -282,12 +319,15 @@ def test_any_motion_is_forgotten_and_the_others_stay():
     ],
 )
 def test_membership_shows_in_the_auc_on_either_side_and_in_the_hits(auc, hits, expected):
-    of = {"auc": over_seeds(auc), "tpr_at_5_percent_fpr": over_seeds(hits)}
+    of = {
+        repeat: {"auc": one, "tpr_at_5_percent_fpr": other, "episodes": 40}
+        for repeat, one, other in zip(REPEATS, auc, hits, strict=False)
+    }
     wanted = {"targets": ["punch", "kick"], "episodes": 20}
-    found = list(membership.findings({"conditions": wanted, "results": {"policies": {"λ = 16": of}}}))
+    found = list(membership.findings({"conditions": wanted, "results": {"attacks": {"λ = 16": of}}}))
     assert [one.word for one in found] == expected
     assert [one.main for one in found] == [True, False]
-    assert found[1].evidence.endswith("guessing 0.07")  # of 41 alike, one is among the first three in 3 of 41 cases
+    assert "; guessing 0.07" in found[1].evidence  # of 41 alike, one is among the first three in 3 of 41 cases
 
 
 def curve(at: int, first: float = 0.1) -> dict:
@@ -301,7 +341,18 @@ def relearned(unlearned: list[int], distilled: list[int]) -> list:
         label: {str(Repeat(0, seed)): curve(at) for seed, at in enumerate(of)}
         for label, of in (("unlearned", unlearned), ("distilled", distilled))
     }
-    return list(relearning.findings({"results": {"base": dict.fromkeys(REPEATS, 0.9), "starts": starts}}))
+    return list(relearning.findings({"results": relearning_results(starts)}))
+
+
+GOOD = {"mean": 0.9, "low": 0.85, "n": 9}  # of the kept clips' skill
+
+
+def relearning_results(starts: dict, kept: float = 0.9) -> dict:
+    """The study's JSON with controls that retain so much of the kept clips' skill, at the least."""
+    skill = {"mean": kept + 0.05, "low": kept, "high": kept + 0.1, "n": 200}
+    origins = {label: {"settings": {}, "kept_skill": dict.fromkeys(REPEATS, skill)} for label in starts}
+    base = dict.fromkeys(REPEATS, 0.9)
+    return {"base": base, "starts": starts, "origins": {"bases": ["b"], "starts": origins}}
 
 
 @pytest.mark.parametrize(
@@ -351,7 +402,7 @@ def test_what_is_near_a_target_loses_more_by_rank_and_against_the_others():
     # 0.5 - 0.9, 0.6 - 0.9 and 0.7 - 1.0
     assert less.evidence == "retention of spinkick minus the other kept clips' mean -33 % [-48, -19]; bound 0 %"
     assert overlap.answer(document).endswith("of the others: -33 % [-48, -19] (spinkick, with kick forgotten).")
-    near_kept = {"spinkick": [1.0] * 3, "punch": [0.9, 0.8, 0.9], "run": [0.7] * 3, "walk": [0.6] * 3}
+    near_kept = {"spinkick": [1.0] * 3, "punch": [0.9, 0.8, 0.9], "run": [0.7, 0.85, 0.7], "walk": [0.6] * 3}
     turned = overlap_document(near_kept, far)
     assert [of.word for of in overlap.findings(turned)][:2] == ["does not hold", "does not hold"]
 
@@ -378,16 +429,55 @@ def test_the_study_says_nothing_against_the_verdicts_rule(unlearned, control):
         assert word == "one run: no"
 
 
-def test_relearning_is_compared_with_every_control_and_says_which_one_starts_near_the_level():
-    def seeds(at: int, first: float) -> dict:
-        return {repeat: curve(at, first) for repeat in REPEATS}
+def test_relearning_is_compared_with_every_control_but_a_random_one_and_says_which_one_starts_near_the_level():
+    def seeds(first_at: int, first: float) -> dict:
+        return {repeat: curve(first_at, first) for repeat in REPEATS}
 
+    # As many target steps an iteration more as makes the runs differ: 100, 101 and 102.
     starts = {"unlearned": seeds(2, 0.1), "distilled": seeds(3, 0.4), "fresh": seeds(4, 0.09)}
-    found = list(relearning.findings({"results": {"base": dict.fromkeys(REPEATS, 0.9), "starts": starts}}))
-    assert [of.word for of in found] == ["the control starts near it", *["does not hold"] * 5]
+    for runs in starts.values():
+        for place, of in enumerate(runs.values()):
+            of["target_steps"] = [(100.0 + place) * step for step in range(6)]
+    found = list(relearning.findings({"results": relearning_results(starts)}))
+    assert [of.word for of in found] == ["the control starts near it", *["does not hold"] * 2]
+    assert [of.main for of in found] == [False, True, False]
     assert (found[0].p, found[0].main) == (None, False)
     assert found[0].evidence.endswith(", and starts at 44 %")
-    assert "than a fresh policy needs" in found[3].claim
     del starts["fresh"][REPEATS[0]]["iterations"][0]
     first = relearning.at_first({"base": dict.fromkeys(REPEATS, 0.9), "starts": starts}, "fresh")
     assert first == {repeat: pytest.approx(0.1) for repeat in REPEATS[1:]}
+
+
+def test_a_control_that_lost_the_kept_clips_decides_nothing():
+    starts = {"unlearned": {of: curve(1) for of in REPEATS}, "distilled": {of: curve(4) for of in REPEATS}}
+    poor = relearning_results(starts, kept=0.79)
+    assert {(of.word, of.main, of.n) for of in relearning.findings({"results": poor})} == {
+        ("the control is unusable", False, 0)
+    }
+    assert claim.answer("c", relearning.findings({"results": poor})).word == "not measured"
+    assert relearning.answer({"results": poor}).endswith("on them: unusable (distilled, kept skill 84 % [79, 89]).")
+    assert relearning.competent(relearning_results(starts, kept=0.8), "distilled") == REPEATS
+    # One of three that is unusable leaves two, of which the words speak.
+    poor["origins"]["starts"]["distilled"]["kept_skill"] |= {of: GOOD for of in REPEATS[1:]}
+    found = list(relearning.findings({"results": poor}))[1]
+    assert (found.n, found.main) == (2, True)
+    assert found.evidence.endswith("; 1 more distilled unusable")
+    del poor["origins"]
+    assert "distilled: unknown of the kept clips' skill" in next(iter(relearning.findings({"results": poor}))).evidence
+
+
+def test_a_retrained_policy_beside_one_of_three_bases_is_one_run_and_a_run_that_never_got_there_only_bounds():
+    repeats = [str(Repeat(base, 0)) for base in range(3)]
+    starts = {"unlearned": dict(zip(repeats, map(curve, (1, 2, 1)), strict=True)), "retrained": {repeats[0]: curve(4)}}
+    starts["distilled"] = dict(zip(repeats, map(curve, (4, 9, 9)), strict=True))
+    results = relearning_results(starts)
+    results["base"] = dict.fromkeys(repeats, 0.9)
+    for of in results["origins"]["starts"].values():
+        of["kept_skill"] = {repeat: GOOD for repeat in repeats}
+    found = {(of.claim.split()[-3], of.main): of for of in relearning.findings({"results": results})}
+    assert (found["retrained", True].word, found["retrained", True].n) == ("one run: no", 1)
+    assert (found["distilled", True].n, found["distilled", True].unit) == (3, "base")
+    # 100 - 400, and at the ends of two runs 200 - 500 and 100 - 500
+    assert relearning.answer({"results": results}).endswith(
+        "-300, at most -300, at most -400 (run by run) (distilled, n = 3 bases); -300 (retrained, n = 1)."
+    )

@@ -96,7 +96,9 @@ def test_membership_learns_from_the_kept_clips_and_is_asked_about_the_targets(tm
             return {key: rollout(values, names) for key, values in of.items()}, names
 
     lab = Attacked(tmp_path)
-    found = membership.measure(lab)["policies"]
+    measured = membership.measure(lab)
+    assert measured["attacks"]["λ = 16"][FIRST]["episodes"] == 4
+    found = membership.over_runs({"results": measured})
     hits = {
         **{"base": (12 / 16, 3 / 4, 1), "λ = 16": ((0 + 8 / 16) / 2, (0 + 2 / 4) / 2, 2)},
         **{"fine-tuned, all clips": (1.0, 1.0, 2), "distilled": ((4 / 16 + 12 / 16) / 2, (1 / 4 + 3 / 4) / 2, 2)},
@@ -162,6 +164,9 @@ def test_relearning_starts_from_each_policy_and_its_levels_are_the_bases(tmp_pat
         *(("unlearned", "0"), ("unlearned", "1"), ("distilled", "0"), ("distilled", "1")),
         *(("retrained", "0"), ("fresh", "0"), ("fresh", "1")),
     }
+    lab.repeats = (*lab.repeats, Repeat(1, 0))  # a second base would start the same fresh training
+    fresh = {repeat for label, repeat in relearning.relearning_runs(lab, {}) if label == "fresh"}
+    assert fresh == {Repeat(0, 0), Repeat(0, 1)}
     for (label, seed), curve in curves.items():
         at_start = AT_START.get(f"{label}-{seed}", 0.0)
         own = [] if label == "fresh" else [at_start + 0.01 * int(seed)]
@@ -277,9 +282,12 @@ def test_the_heat_map_has_the_base_first_and_then_every_evaluation_of_each_seed(
         write_rows(tmp_path / f"λ = 16-{seed}" / "evaluations.jsonl", rows)
     found = heat_map.measure(lab)
     assert found["iterations"] == [0, 2, 4]
-    assert [at[TARGET][TRACKING]["mean"] for at in found["checkpoints"]] == pytest.approx([0.85, 0.4, 0.4])
-    assert [at["target"][TRACKING]["mean"] for at in found["groups"]] == pytest.approx([0.85, 0.4, 0.4])
-    assert [at["kept"]["tracking_reward"]["mean"] for at in found["groups"]] == pytest.approx([0.8, 0.7, 0.7])
+    document = {"conditions": {"targets": [TARGET]}, "results": found}
+    checkpoints, groups = (heat_map.over_runs(document, of) for of in ("checkpoints", "groups"))
+    assert [at[TARGET][TRACKING]["mean"] for at in checkpoints] == pytest.approx([0.85, 0.4, 0.4])
+    assert [at["target"][TRACKING]["mean"] for at in groups] == pytest.approx([0.85, 0.4, 0.4])
+    assert [at["kept"]["tracking_reward"]["mean"] for at in groups] == pytest.approx([0.8, 0.7, 0.7])
+    assert [at[TARGET][TRACKING] for at in found["runs"][SECOND]] == pytest.approx([0.9, 0.3, 0.3])
     assert lab.wanted == [{("λ = 16", of): {"set": ["evaluate_every=2", "evaluate_episodes=2"]} for of in lab.repeats}]
 
 
@@ -317,10 +325,12 @@ def test_trainings_from_scratch_are_on_all_clips_and_compared_over_all_evaluatio
     assert words[0][0] == "The wrench helps a training from scratch"
     assert words[0][1].startswith("tracking with it minus without 0.00")
     assert words[1][1:] == (
-        "tracking with it minus without 0.200 [0.200, 0.200], success 10 % [10, 10]; bound 0",
-        "holds",
+        "tracking with it minus without 0.200, success 10 %; bound 0",
+        "one value",  # as both trainings are the same here
     )
-    assert "| uniform RSI | 2 | 10 % [10, 10]" in from_scratch.body(document)
+    assert found["episodes"] == 4  # of the two clips, two each
+    # One success of eight, exactly: 0.3 % to 53 %.
+    assert "| uniform RSI | 2 | 10 % [0, 53]" in from_scratch.body(document)
 
 
 def test_overlap_forgets_half_a_clip_and_keeps_the_other_on_a_library_of_its_own(tmp_path, library_folder, robot):
@@ -374,8 +384,10 @@ def test_training_curves_are_over_the_rows_that_every_seed_has(tmp_path):
     assert list(found) == [training_dynamics.A, training_dynamics.B]
     of = found[training_dynamics.B]
     assert of["iterations"] == [1, 10, 20]
-    assert [row["entropy"]["mean"] for row in of["rows"]] == [1.5, 10.5, 20.5]
-    assert [row.get("target/lambda_crit", {}).get("mean") for row in of["rows"]] == [9.0, None, 7.5]
+    rows = training_dynamics.over_runs(of)
+    assert [row["entropy"]["mean"] for row in rows] == [1.5, 10.5, 20.5]
+    assert [row.get("target/lambda_crit", {}).get("mean") for row in rows] == [9.0, None, 7.5]
+    assert [row["entropy"] for row in of["runs"][SECOND]] == [2, 11, 21]
     (wanted,) = lab.wanted
     assert wanted[training_dynamics.A, Repeat(0, 1)] == {"penalty": 2.0, "sampler": "adaptive", "wrench": True}
     assert wanted[training_dynamics.B, Repeat(0, 0)] == {"penalty": 8.0}

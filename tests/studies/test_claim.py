@@ -5,7 +5,7 @@ import math
 import pytest
 from scipy import stats
 
-from forgetmimic_jax.evaluation.repeats import Repeat
+from forgetmimic_jax.evaluation.repeats import Repeat, over_repeats
 from forgetmimic_jax.evaluation.statistics import over_seeds
 from forgetmimic_jax.studies import claim, variants
 from forgetmimic_jax.studies.claim import Between, Finding, answer, corrected, finding, finding_between, judged, p_value
@@ -41,8 +41,37 @@ def test_a_p_value_is_that_of_students_test_and_crosses_five_per_cent_with_the_i
         assert p_value(estimate, bound) == pytest.approx(stats.ttest_1samp(values, bound).pvalue)
     assert p_value(estimate, estimate["high"]) == pytest.approx(0.05)
     assert p_value(over_seeds([0.3]), 0.1) is None
-    assert p_value(over_seeds([0.3, 0.3]), 0.1) == 0.0
-    assert p_value(over_seeds([0.3, 0.3]), 0.3) == 1.0
+
+
+def test_numbers_without_spread_that_are_no_rates_decide_nothing():
+    same = over_repeats(dict.fromkeys(REPEATS, 0.3))
+    assert (p_value(same, 0.1), judged(same, 0.1), judged(same, 0.5)) == (None, "one value", "one value")
+    found = finding("c", same, 0.5, "0.3; bound 0.5", main=True)
+    assert (found.word, found.p, found.evidence) == ("one value", None, "0.3; bound 0.5")
+    assert answer("c", [found, Finding("", "holds", "", 3, main=True)]).word == "open"
+
+
+def test_without_a_main_finding_a_claim_is_not_measured():
+    found = answer("the claim", [Finding("part", "holds", "number", 3)])
+    assert (found.word, found.evidence, found.n) == ("not measured", "", 0)
+
+
+def test_the_seeds_of_one_base_among_several_decide_nothing():
+    of_one = finding("", over_repeats(dict(zip(REPEATS, (0.1, 0.11, 0.12), strict=True))), 0.5, "")
+    of_all = finding("", over_repeats({f"base {n}, seed 0": 0.1 + 0.01 * n for n in range(3)}), 0.5, "")
+    alone = finding("", over_repeats({REPEATS[0]: 0.1}), 0.5, "")
+    assert [of.word for of in corrected([of_one, of_all, alone], bases=3)] == ["one base: yes", "holds", "one run: yes"]
+    assert corrected([of_one], bases=3)[0].p is None
+    assert corrected([of_one], bases=1)[0].word == "holds"
+
+
+def test_an_interval_that_spans_its_bound_says_how_many_units_would_decide():
+    # Mean 2, standard deviation 1: t(0.975, 3) / sqrt(4) = 1.59 and t(0.975, 2) / sqrt(3) = 2.48 lie about 2.
+    values = over_repeats({f"base {n}, seed 0": value for n, value in enumerate((1.0, 2.0, 3.0))})
+    assert finding("", values, 0.0, "2").evidence == "2; with this mean and spread 4 bases would decide"
+    # A distance of 0.1 needs 1.96² / 0.1² = 384 at the least.
+    assert finding("", values, 1.9, "2").evidence == "2; with this mean and spread not even 100 bases would decide"
+    assert finding("", values, -1.0, "2").evidence == "2"  # holds or fails as it is
 
 
 def test_a_rate_that_is_the_same_in_every_run_is_tested_by_all_its_episodes():
@@ -76,8 +105,10 @@ def test_a_number_of_which_only_bounds_are_known_decides_what_they_allow():
     known, under, over = Between(5.0, 5.0), Between(-math.inf, 6.0), Between(16.0, math.inf)
     assert word([known, under, known], below=True) == "holds"
     assert word([known, under, known], below=False) == "does not hold"
-    assert word([over, over, over], below=True) == "does not hold"
-    assert word([over, over, over], below=False) == "holds"
+    further = Between(17.0, math.inf)
+    assert word([over, further, over], below=True) == "does not hold"
+    assert word([over, further, over], below=False) == "holds"
+    assert word([over, over, over], below=True) == "open"  # without spread
     assert word([known, known, over], below=True) == "open"
     assert word([under, over], below=True) == "open"
     assert word([under], below=True) == "one run: yes"
@@ -131,4 +162,4 @@ def test_a_studys_answer_needs_all_of_its_main_findings(words, word):
 def test_the_table_has_the_main_findings_first():
     found = [finding("b", over_seeds([1.0, 1.1]), 9.0, "one"), finding("a", over_seeds([1.0]), 9.0, "two", main=True)]
     rows = claim.findings_table(found).splitlines()[2:]
-    assert rows == ["| a | **one run: yes** | two | 1 |", "| b | **holds** | one | 2 |"]
+    assert rows == ["| a | **one run: yes** | two | 1 |", "| b | **holds** | one | 2 seeds |"]

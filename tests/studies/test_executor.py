@@ -19,6 +19,7 @@ from forgetmimic_jax.basics.errors import InputError, Interrupted
 from forgetmimic_jax.basics.provenance import cores, provenance
 from forgetmimic_jax.studies import executor, task
 from forgetmimic_jax.studies.executor import RESOURCE, on_cluster, run_tasks, run_together
+from forgetmimic_jax.studies.process import CODE
 from forgetmimic_jax.studies.task import ATTEMPTS, Task, run_task
 
 RUN = """#!{python}
@@ -218,12 +219,26 @@ def test_the_process_of_a_task_ends_with_its_starter(monkeypatch):
     code = "import runpy, time; runpy.run_module = lambda *_, **__: time.sleep(60); "
     code += "import sys; exec(open(sys.argv[1]).read())"
     path = Path(task.__file__).with_name("process.py")
-    process = subprocess.Popen([sys.executable, "-c", code, path], stdin=subprocess.PIPE)
+    environment = os.environ | {CODE: provenance().code}
+    process = subprocess.Popen([sys.executable, "-c", code, path], stdin=subprocess.PIPE, env=environment)
     time.sleep(0.5)
     assert process.poll() is None
     assert process.stdin
     process.stdin.close()
     assert process.wait(timeout=60) == -signal.SIGKILL
+
+
+def test_the_process_of_a_task_has_the_code_of_its_starter_or_none(monkeypatch):
+    monkeypatch.undo()
+    path = Path(task.__file__).with_name("process.py")
+    environment = os.environ | {CODE: "0123abcd"}
+    ended = subprocess.run([sys.executable, path, "--help"], env=environment, capture_output=True, text=True)
+    assert ended.returncode == 1
+    here = provenance().code
+    assert (
+        ended.stderr
+        == f"error: the checkout has changed: found code {here}; accepted: 0123abcd, which wants the task\n"
+    )
 
 
 LOCAL = {"host": "127.0.0.1", "protocol": "tcp://", "dashboard_address": ":0"}

@@ -13,6 +13,7 @@ from forgetmimic_jax.studies.document import (
     made_by,
     origin_of,
     read_document,
+    same_bases,
     write_document,
 )
 
@@ -85,6 +86,12 @@ def test_runs_of_other_code_are_only_added_to_where_the_user_mixes_them(tmp_path
     for mix in (False, True):
         with pytest.raises(InputError, match=r"made by older code \(stored with commit abc1234\), which this"):
             check_same_code(path, document([older]), mix=mix)
+
+
+def test_a_stored_run_can_stand_beside_new_ones_where_a_base_is_the_same():
+    stored = {"conditions": {"bases": [{"policy": "aa"}, {"policy": "bb"}]}}
+    assert same_bases(stored, {"bases": [{"policy": "bb"}, {"policy": "cc"}]})
+    assert not same_bases(stored, {"bases": [{"policy": "cc"}]})
 
 
 def test_what_is_no_study_says_nothing_of_trials(tmp_path):

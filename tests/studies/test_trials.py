@@ -49,7 +49,11 @@ def test_the_same_question_has_the_same_folder_wherever_its_base_lies(tmp_path, 
     different = [{"penalty": 9.0}, {"iterations": 6}, {"seed": 1}, {"set": ["ppo.base_kl=0.5"]}, {"episodes": 3}]
     folders = {make_trial(tmp_path, wanted | change).folder for change in different}
     meta = json.loads((base / "meta.json").read_text())
-    (base / "meta.json").write_text(json.dumps({**meta, "iteration": meta["iteration"] + 1}))
+    # A copy that another commit on another machine wrote is the same policy; another policy file is not.
+    (base / "meta.json").write_text(json.dumps({**meta, "made": {"code": "0123abcd", "processor": "another"}}))
+    assert make_trial(tmp_path, wanted).folder == same.folder
+    files = {**meta["files"], "policy.safetensors": 64 * "0"}
+    (base / "meta.json").write_text(json.dumps({**meta, "files": files}))
     folders.add(make_trial(tmp_path, wanted).folder)
     library = Path(
         shutil.copytree(DATA_DIR / "g1", tmp_path / "library", ignore=shutil.ignore_patterns("base", "unlearned-*"))
@@ -72,3 +76,20 @@ def test_other_code_makes_another_trial(tmp_path, base, monkeypatch):
     monkeypatch.setattr(trials, "provenance", lambda: other)
     found.append(make_trial(tmp_path, {"base": base, "iterations": 5}).folder.name)
     assert found[1] == f"{without_code(found[0])}-0123abcd"
+
+
+@pytest.mark.parametrize("note", ["evaluation.json", "checkpoints/00000005/meta.json"])
+def test_a_trial_that_other_code_made_a_part_of_has_failed_and_says_so(tmp_path, base, note):
+    trial = make_trial(tmp_path, {"base": base, "iterations": 5})
+    here = {"made": {"code": provenance().code}}
+    for path in ("evaluation.json", "checkpoints/00000005/meta.json"):
+        (trial.folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (trial.folder / path).write_text(json.dumps(here))
+    assert trial.finished
+    assert trials.run_trials([trial], jobs=1, cluster=None, description="try") == {}
+    (trial.folder / note).write_text(json.dumps({"made": {"code": "0123abcd"}}))
+    assert not trial.finished
+    (reason,) = trials.run_trials([trial], jobs=1, cluster=None, description="try").values()
+    assert reason == (
+        f"code 0123abcd made a part of it, as the checkout changed meanwhile; remove {trial.folder} to run it again"
+    )

@@ -26,7 +26,7 @@ def test_numbers_of_several_seeds_become_students_intervals():
 
 def test_one_seed_has_no_interval_and_a_number_that_some_lack_is_over_the_others():
     found = estimates_of(by_repeat([{"skill": 0.5}, {}]))
-    assert found == {"skill": {"mean": 0.5, "n": 1}}
+    assert found == {"skill": {"mean": 0.5, "n": 1, "unit": "seed"}}
 
 
 def test_seeds_that_all_fail_have_the_exact_interval_of_their_episodes_together():
@@ -104,7 +104,7 @@ def test_the_table_shows_base_floor_variants_and_the_paper(variants):
     targets = [line.split(" | ") for line in text.splitlines() if line.startswith("| ")]
     assert [row[0] for row in targets[2:6]] == ["| base", "| zero action", "| λ = 16", "| *paper: λ = 16*"]
     # 0.9 ± 12.7 · 0.1: no interval leaves what a rate can be
-    assert targets[2][1:4] == ["2", "90 % [0, 100]", "0.75 [0.75, 0.75]"]
+    assert targets[2][1:4] == ["2 seeds", "90 % [0, 100]", "0.75"]
     assert targets[5][1:5] == ["", "0 %", "", "0.60"]
     assert "another library" in text
 
@@ -116,7 +116,7 @@ def test_numbers_without_terminations_are_columns_which_are_empty_where_a_trial_
     for seed, run in enumerate(variants["λ = 16"]["runs"].values()):
         run["policy"]["target"] |= {"upright_rate": 0.0, "impact_rate": 0.9 + 0.1 * seed, "motion_content": -0.9}
     rows = [line.split(" | ") for line in variant_table(variants, {}).splitlines() if line.startswith("| λ")]
-    assert rows[0][-3:] == ["0 % [0, 0]", "95 % [31, 100]", "-0.90 [-0.90, -0.90] |"]
+    assert rows[0][-3:] == ["0 %", "95 % [31, 100]", "-0.90 |"]
     assert len(rows[1]) == 9, "kept clips have none"
 
 
