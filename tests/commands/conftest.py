@@ -32,9 +32,12 @@ def compiled_once() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(scope="session", autouse=True)
+@pytest.fixture(scope="module", autouse=True)
 def rolled_out_once() -> Iterator[None]:
-    """Evaluations on the same episodes of environments with equal settings share what is compiled."""
+    """Evaluations on the same episodes of environments with equal settings share what is compiled.
+
+    Of one file alone, since every environment also holds the memory of its simulations.
+    """
     made: dict[tuple, Any] = {}
 
     def program_of(rolls: Evaluator | SideBySide) -> tuple:
