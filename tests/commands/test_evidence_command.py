@@ -128,7 +128,7 @@ def test_evidence_of_another_policy_is_refused(run, printed, tmp_path, refused):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"run": Path("nowhere")}, "nowhere: no run with a checkpoint"),
+        ({"run": "nowhere"}, "nowhere: no run with a checkpoint"),
         (
             {"control": Path("nowhere")},
             "nowhere: no such folder; name a run of distill, retrain or pretrain, or ",
@@ -221,7 +221,7 @@ def test_every_run_to_attack_is_a_task(run, tmp_path, monkeypatch):
     given = []
     monkeypatch.setattr(executor, "run_tasks", lambda tasks, **how: given.append((tasks, how)) or {})
     one = evidence.Options(run="a", full=True, recovery_iterations=7)
-    evidence.main(dataclasses.replace(one, run=Path(",".join(map(str, runs))), **where))
+    evidence.main(dataclasses.replace(one, run=",".join(map(str, runs)), **where))
     ((tasks, how),) = given
     assert {name: how[name] for name in where} == where
     for folder, task in zip(runs, tasks, strict=True):
