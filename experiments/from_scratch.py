@@ -31,7 +31,7 @@ FRESH = {"method": "retrain", "clips": "all"}  # no clip is left out: a training
 VARIANTS: Mapping[str, Mapping[str, Any]] = {
     ADAPTIVE: {"sampler": "adaptive"},
     WITH_WRENCH: {"sampler": "adaptive", "wrench": True},
-    UNIFORM: {"sampler": "uniform_bins"},
+    UNIFORM: {"sampler": "uniform_clips"},  # all three draw the clips evenly at first
 }
 PAIRS = {"The wrench": (WITH_WRENCH, ADAPTIVE), "Adaptive RSI": (ADAPTIVE, UNIFORM)}
 

@@ -314,7 +314,7 @@ def test_trainings_from_scratch_are_on_all_clips_and_compared_over_all_evaluatio
     (wanted,) = lab.wanted
     assert set(wanted) == {(label, repeat) for label in tracking for repeat in lab.repeats}
     assert wanted[from_scratch.UNIFORM, Repeat(0, 0)] == {
-        **{"method": "retrain", "clips": "all", "sampler": "uniform_bins"},
+        **{"method": "retrain", "clips": "all", "sampler": "uniform_clips"},
         "set": ["evaluate_every=2", "evaluate_episodes=2"],
     }
     assert found["environment_steps"] == [100, 200]
