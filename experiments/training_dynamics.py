@@ -134,10 +134,12 @@ def answer(document: Document) -> str:
 def draw(document: Document) -> Figure:
     """One panel a curve, with its interval as a band."""
     figure = new_figure(width=11.0, height=7.5)
+    configurations = document["results"]["configurations"]
+    rows = {label: list(zip(of["iterations"], over_runs(of), strict=True)) for label, of in configurations.items()}
     for place, name in enumerate(CURVES):
         axes = figure.add_subplot(3, 3, place + 1)
-        for label, of in document["results"]["configurations"].items():
-            points = [(at, row[name]) for at, row in zip(of["iterations"], over_runs(of), strict=True) if name in row]
+        for label, of in rows.items():
+            points = [(at, row[name]) for at, row in of if name in row]
             iterations = [at for at, _ in points]
             means, low, high = (
                 [estimate.get(end, estimate["mean"]) for _, estimate in points] for end in ("mean", "low", "high")

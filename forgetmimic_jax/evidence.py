@@ -244,7 +244,7 @@ def _judge_fakes(
     from forgetmimic_jax.policy.policy import Policy
     from forgetmimic_jax.training import checkpoint
 
-    run = Path(options.run)
+    run = parts.folder.parent
 
     def trained(name: str, **given: Any) -> Policy:
         folder = run.with_name(f"{run.name}-{name}")

@@ -115,9 +115,10 @@ def run_trials(trials: Sequence[Trial], *, jobs: int, cluster: str | None, descr
     tasks = {trial: trial.task for trial in trials if not trial.other_code}
     failed = run_tasks(list(tasks.values()), jobs=jobs, cluster=cluster, description=description)
     reasons = {trial: failed[task] for trial, task in tasks.items() if task in failed}
-    return reasons | {trial: _mixed(trial) for trial in trials if trial.other_code}
-
-
-def _mixed(trial: Trial) -> str:
-    codes = " and ".join(sorted(trial.other_code))
-    return f"code {codes} made a part of it, as the checkout changed meanwhile; remove {trial.folder} to run it again"
+    for trial in trials:
+        if codes := " and ".join(sorted(trial.other_code)):
+            reasons[trial] = (
+                f"code {codes} made a part of it, as the checkout changed meanwhile; "
+                f"remove {trial.folder} to run it again"
+            )
+    return reasons

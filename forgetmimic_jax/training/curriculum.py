@@ -108,7 +108,7 @@ class Curriculum:
     def start(self) -> Kept:
         """The policy that this stage starts from: the best one, or for a specialist its clip's expert."""
         assert self.best is not None
-        return self.experts.get(self.specialist or "", self.best)
+        return self.experts.get(self.specialist, self.best) if self.specialist else self.best
 
     def states(self, config: PretrainConfig) -> dict[str, ClipState]:
         """The state of every clip."""

@@ -22,12 +22,16 @@ SHOWN = ("success_rate", "survival_weighted_tracking", "tracking_reward", "episo
 
 def clip_means(rollout: Rollout, names: Sequence[str]) -> dict[str, dict[str, float]]:
     """What a row says of every clip; `completed` is the success from the first frame."""
-    metrics = episode_metrics(rollout)
-    of_clip = {clip: rollout.clip == i for i, clip in enumerate(names)}
-    means = {clip: {name: metrics[name][here] for name in SHOWN} for clip, here in of_clip.items()}
-    for clip, here in of_clip.items():
-        means[clip]["completed"] = metrics["success_rate"][here & (rollout.start_frame == 0)]
-    return {clip: {name: round(float(found.mean()), 4) for name, found in of.items()} for clip, of in means.items()}
+    metrics, from_the_first = episode_metrics(rollout), rollout.start_frame == 0
+
+    def mean(name: str, episodes: np.ndarray) -> float:
+        return round(float(metrics[name][episodes].mean()), 4)
+
+    return {
+        clip: {name: mean(name, rollout.clip == i) for name in SHOWN}
+        | {"completed": mean("success_rate", (rollout.clip == i) & from_the_first)}
+        for i, clip in enumerate(names)
+    }
 
 
 class Watch:
