@@ -10,10 +10,9 @@ import numpy as np
 from forgetmimic_jax.basics.files import read_rows
 from forgetmimic_jax.evaluation.plots import curve, heat_map, new_figure
 from forgetmimic_jax.evaluation.repeats import over_repeats
-from forgetmimic_jax.evaluation.tables import markdown_table, number
+from forgetmimic_jax.evaluation.tables import markdown_table, number, share
 from forgetmimic_jax.studies.claim import Finding, finding
 from forgetmimic_jax.studies.conduct import main
-from forgetmimic_jax.studies.findings import share
 from forgetmimic_jax.studies.lab import Lab
 from forgetmimic_jax.studies.study import Document, Study
 from forgetmimic_jax.studies.variants import TRACKING, estimates_of, within

@@ -24,24 +24,20 @@ from forgetmimic_jax.evaluation.relearning import (
     DECISIVE,
     LEVELS,
     Lasted,
-    Origin,
-    Origins,
     at_first,
-    comparable_settings,
     lasted,
 )
 from forgetmimic_jax.evaluation.repeats import Repeat, over_repeats, units
-from forgetmimic_jax.evaluation.tables import KEPT, markdown_table, number, percent
-from forgetmimic_jax.evaluation.verdict import retained, skills
+from forgetmimic_jax.evaluation.skill import retained, skills
+from forgetmimic_jax.evaluation.tables import KEPT, markdown_table, number, percent, share
 from forgetmimic_jax.studies import paper
 from forgetmimic_jax.studies.claim import Between, Finding, finding_between
 from forgetmimic_jax.studies.conduct import main
-from forgetmimic_jax.studies.findings import share
 from forgetmimic_jax.studies.lab import Key, Lab, newest_policy
 from forgetmimic_jax.studies.policies import retrained_in_words
 from forgetmimic_jax.studies.study import ITERATIONS, Document, Study
 from forgetmimic_jax.studies.variants import TRACKING, within
-from forgetmimic_jax.training.checkpoint import policy_hash, read_info
+from forgetmimic_jax.training.checkpoint import read_info
 from forgetmimic_jax.unlearning.method import FINE_TUNING, SHORT
 from forgetmimic_jax.unlearning.registry import method_of
 
@@ -76,24 +72,22 @@ def measure(lab: Lab) -> dict[str, Any]:
         for (label, of), folder in relearned.items():
             if of == repeat:
                 curves[label][str(repeat)] = curve_of(folder, lab.targets, first.get(label))
-    return {"base": base, "starts": curves, "origins": msgspec.to_builtins(origins(lab, folders))}
+    return {"base": base, "starts": curves, "kept_skill": measured_skills(folders)}
 
 
-def origins(lab: Lab, folders: Mapping[Key, Path]) -> Origins:
-    """How the policies of each start were trained, so that a report can see whether the curves belong to its run.
+def measured_skills(folders: Mapping[Key, Path]) -> dict[str, dict[str, Any]]:
+    """By start and repeat: share of the base's skill on the kept clips that the policy retains.
 
     Args:
-        lab: of the study.
         folders: by start and repeat, the run that trained or evaluated the policy.
     """
-    starts: dict[str, Origin] = {}
+    found: dict[str, dict[str, Any]] = {}
     for (label, repeat), folder in folders.items():
-        config = read_info(newest_policy(folder)).config
-        origin = starts.setdefault(label, Origin(comparable_settings(config), {}))
-        kept = skills(read_evaluation(folder / FILE).policies[method_of(config).result], target=False)
+        result = method_of(read_info(newest_policy(folder)).config).result
+        kept = skills(read_evaluation(folder / FILE).policies[result], target=False)
         if kept:
-            origin.kept_skill[str(repeat)] = retained(kept).estimate
-    return Origins([policy_hash(base) for base in lab.bases], starts)
+            found.setdefault(label, {})[str(repeat)] = msgspec.to_builtins(retained(kept).estimate)
+    return found
 
 
 def relearning_runs(lab: Lab, policies: Mapping[Key, Path]) -> dict[Key, dict[str, Any]]:
@@ -185,8 +179,7 @@ def body(document: Document) -> str:
 
 def kept_skills(results: Mapping[str, Any], start: str) -> dict[str, Estimate]:
     """By repeat: share of the base's skill on the kept clips that a start retains; absent where it is not known."""
-    origin = results.get("origins", {}).get("starts", {}).get(start, {})
-    return msgspec.convert(origin.get("kept_skill", {}), dict[str, Estimate])
+    return msgspec.convert(results.get("kept_skill", {}).get(start, {}), dict[str, Estimate])
 
 
 def kept_in_words(skills: Mapping[str, Estimate]) -> str:

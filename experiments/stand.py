@@ -15,10 +15,9 @@ from forgetmimic_jax.evaluation.metrics import BASE, UNLEARNED
 from forgetmimic_jax.evaluation.plots import bars, new_figure
 from forgetmimic_jax.evaluation.repeats import difference_over_repeats, over_repeats, rate_over_repeats, units
 from forgetmimic_jax.evaluation.statistics import PlainEstimate
-from forgetmimic_jax.evaluation.tables import markdown_table, number, percent
+from forgetmimic_jax.evaluation.tables import markdown_table, number, percent, share
 from forgetmimic_jax.studies.claim import Finding, finding
 from forgetmimic_jax.studies.conduct import main
-from forgetmimic_jax.studies.findings import share
 from forgetmimic_jax.studies.lab import Lab
 from forgetmimic_jax.studies.study import Document, Study
 from forgetmimic_jax.studies.targets import usual_groups

@@ -238,9 +238,9 @@ def _judge_fakes(
     from forgetmimic_jax.attacks.document import write_document
     from forgetmimic_jax.attacks.fakes import fakes
     from forgetmimic_jax.attacks.judged import FILE, Judged, judged
+    from forgetmimic_jax.attacks.verdict import CONSISTENT, FAILED
     from forgetmimic_jax.basics.console import say, warn
     from forgetmimic_jax.evaluation.metrics import BASE
-    from forgetmimic_jax.evaluation.verdict import CONSISTENT, FAILED
     from forgetmimic_jax.policy.policy import Policy
     from forgetmimic_jax.training import checkpoint
 

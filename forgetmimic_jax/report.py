@@ -19,18 +19,14 @@ class Options:
     """Describe an unlearning run on one self-contained HTML page, with the same facts as JSON beside it.
 
     Every number comes from the run's own files. The verdict is one of four phrases, whose rules the page states: from
-    evidence.json of `make evidence` if the run has one, else from the evaluation and the comparisons named here.
+    evidence.json of `make evidence` if the run has one, else from the evaluation alone, which cannot show that the
+    targets stay forgotten.
     """
 
     run: Path
     """Folder of the run, with its evaluation.json."""
     base: Path | None = None
     """Checkpoint that the run started from; the one its settings name by default."""
-    control: Path | None = None
-    """Run to compare with, of the same base, targets and evaluation: of `make unlearn METHOD=distill` or retrain, or
-    of `make pretrain WITHOUT=TARGETS`, evaluated with that base."""
-    relearning: Path | None = None
-    """JSON of experiments/relearning.py with policies trained as this run was: how fast they and a control relearn."""
     films: int = 4
     """Clips to film for at most 4 s: the targets, then those the base does best; one in the run's videos/ is taken."""
     output: Path | None = None
@@ -39,16 +35,16 @@ class Options:
 
 def main(options: Options) -> None:
     """Read and check, judge, film and write."""
-    from forgetmimic_jax.attacks import verdict as attacks
+    from forgetmimic_jax.attacks.verdict import RULES, judge, judge_evaluation
     from forgetmimic_jax.basics.console import closing, command_line, say
     from forgetmimic_jax.basics.files import write_atomically, write_json
     from forgetmimic_jax.evaluation import tables
     from forgetmimic_jax.evaluation.document import to_dict
-    from forgetmimic_jax.evaluation.verdict import RULES, judge
-    from forgetmimic_jax.reporting import comparisons, facts
+    from forgetmimic_jax.evaluation.metrics import UNLEARNED
+    from forgetmimic_jax.reporting import facts
     from forgetmimic_jax.reporting.films import films
     from forgetmimic_jax.reporting.page import page
-    from forgetmimic_jax.reporting.subject import read_subject
+    from forgetmimic_jax.reporting.subject import read_own_evidence, read_subject
     from forgetmimic_jax.training.folder import check_writable
 
     at_least(0, "--films", options.films)
@@ -57,15 +53,8 @@ def main(options: Options) -> None:
         raise InputError(f"--output: found {output}; accepted: an .html file")
     subject = read_subject(options.run, options.base)
     check_writable(output.parent)
-    evidence = comparisons.read_own_evidence(subject)
-    if evidence is None:
-        control = comparisons.read_control(options.control, subject)
-        relearning = comparisons.read_relearning(options.relearning, subject, options.control)
-        verdict, rules = judge(subject.document.policies, control=control, relearning=relearning), RULES
-        missing = facts.missing(control, relearning)
-    else:
-        comparisons.check_alone(options.control, options.relearning, subject)
-        verdict, rules, missing = attacks.judge(evidence), attacks.RULES, []
+    evidence = read_own_evidence(subject)
+    verdict = judge(evidence) if evidence else judge_evaluation(subject.document.policies[UNLEARNED])
     found: dict[str, Any] = {
         "task": facts.task(subject),
         "done": facts.done(subject),
@@ -73,8 +62,8 @@ def main(options: Options) -> None:
         "threshold": facts.threshold(subject),
         "instead": facts.instead(subject),
         "notes": tables.notes(subject.document),
-        "rules": rules,
-        "limits": facts.limits(subject, missing),
+        "rules": RULES,
+        "limits": facts.limits(subject, attacked=evidence is not None),
         "commands": _commands(options, subject),
         "identity": facts.identity(subject),
     }
@@ -100,10 +89,9 @@ def _commands(options: Options, subject: Subject) -> list[str]:
 
     flags = flags_of(subject, options.base)
     changed = settings_changed(subject.info.config, unlearning_run.config_of_new_run(unlearning_run.Options(**flags)))
-    comparisons = {name: getattr(options, name) for name in ("base", "control", "relearning")}
     return [
         f"forgetmimic unlearn {words(flags, changed)} --output {options.run}",
-        f"forgetmimic report {words({'run': options.run, **comparisons})}",
+        f"forgetmimic report {words({'run': options.run, 'base': options.base})}",
     ]
 
 

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.evaluation.document import FILE
-from forgetmimic_jax.evaluation.relearning import comparable_settings
 from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.training import checkpoint
 from forgetmimic_jax.training.checkpoint import CheckpointInfo
@@ -41,29 +39,23 @@ def read_control(run: Path, subject: CheckpointInfo, setup: Setup) -> Checkpoint
     if not run.is_dir():
         raise InputError(f"{run}: no such folder; name a run of distill, retrain or pretrain, or leave it out")
     info = checkpoint.read_info(run)
-    check_never_rolled_out(str(info.path), comparable_settings(info.config), subject.config.unlearn.targets)
+    check_never_rolled_out(info, subject.config.unlearn.targets)
     if info.base not in (None, subject.base):
         raise InputError(f"{run}: base: found {info.base}; accepted: {subject.base}, as in the unlearned run")
     checkpoint.check_matches(info, setup)
     return info
 
 
-def check_never_rolled_out(where: str, settings: Mapping[str, Any], targets: Sequence[str]) -> None:
-    """InputError unless a policy was trained from a fresh one on all clips but the targets.
-
-    Args:
-        where: the settings come from.
-        settings: of its training; see `comparable_settings`.
-        targets: names of clips.
-    """
+def check_never_rolled_out(info: CheckpointInfo, targets: Sequence[str]) -> None:
+    """InputError unless a policy was trained from a fresh one on all clips but the targets."""
     fresh = [name for name, of in methods().items() if of.start != "base"]
-    forgotten = settings.get("unlearn.targets")
+    unlearn = info.config.unlearn
     for name, found, accepted in (
-        ("unlearn.method", settings.get("unlearn.method") if forgotten else "none", fresh),
-        ("sampling.clips", settings.get("sampling.clips"), ["kept"]),
-        ("unlearn.targets", forgotten, [sorted(targets)]),
+        ("unlearn.method", unlearn.method if unlearn.targets else "none", fresh),
+        ("sampling.clips", info.config.sampling.clips, ["kept"]),
+        ("unlearn.targets", sorted(unlearn.targets), [sorted(targets)]),
     ):
         if found not in accepted:
             raise InputError(
-                f"{where}: {name}: found {found}; accepted for a control: {' or '.join(map(str, accepted))}"
+                f"{info.path}: {name}: found {found}; accepted for a control: {' or '.join(map(str, accepted))}"
             )

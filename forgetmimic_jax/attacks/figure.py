@@ -9,7 +9,7 @@ import msgspec
 
 from forgetmimic_jax.attacks.case import TRAINED
 from forgetmimic_jax.attacks.document import CONTROL, Compared, EvidenceDocument, Numbers, Relearning
-from forgetmimic_jax.attacks.verdict import reached
+from forgetmimic_jax.attacks.pace import reached
 from forgetmimic_jax.evaluation.document import Estimate
 from forgetmimic_jax.evaluation.metrics import UNLEARNED
 from forgetmimic_jax.evaluation.plots import bars, new_figure

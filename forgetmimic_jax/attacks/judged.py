@@ -11,10 +11,9 @@ from forgetmimic_jax.attacks.case import Case
 from forgetmimic_jax.attacks.document import EvidenceDocument
 from forgetmimic_jax.attacks.gather import conditions, gather
 from forgetmimic_jax.attacks.parts import Parts
-from forgetmimic_jax.attacks.verdict import judge
+from forgetmimic_jax.attacks.verdict import FAILED, judge
 from forgetmimic_jax.evaluation.metrics import UNLEARNED
 from forgetmimic_jax.evaluation.rollout import Acting
-from forgetmimic_jax.evaluation.verdict import FAILED
 from forgetmimic_jax.policy.policy import Policy
 
 FILE = "fakes.json"

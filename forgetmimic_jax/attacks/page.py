@@ -19,7 +19,8 @@ from forgetmimic_jax.attacks.document import (
     Splices,
 )
 from forgetmimic_jax.attacks.judged import Judged
-from forgetmimic_jax.attacks.verdict import RULES, judge, lasted_until
+from forgetmimic_jax.attacks.pace import lasted_until
+from forgetmimic_jax.attacks.verdict import RULES, judge
 from forgetmimic_jax.evaluation.document import UnboundedResult
 from forgetmimic_jax.evaluation.metrics import UNLEARNED
 from forgetmimic_jax.evaluation.relearning import LEVELS

@@ -10,10 +10,10 @@ import numpy as np
 from forgetmimic_jax.attacks.case import Case
 from forgetmimic_jax.attacks.document import CONTROL, Curve, Relearning
 from forgetmimic_jax.attacks.fine_tuning import shares
+from forgetmimic_jax.attacks.pace import FASTER
 from forgetmimic_jax.attacks.recovery import Workshop
 from forgetmimic_jax.evaluation.metrics import BASE, UNLEARNED
 from forgetmimic_jax.evaluation.relearning import DECISIVE, LEVELS, crossing
-from forgetmimic_jax.evaluation.verdict import FASTER
 from forgetmimic_jax.policy.policy import Policy
 
 FoundOrMade = Callable[[str, Callable[[], Curve]], Curve]  # a curve by name, made where it is not there yet

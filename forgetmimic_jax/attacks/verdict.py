@@ -1,6 +1,7 @@
-"""The verdict from the attacks: the four phrases of `evaluation.verdict`, with the rules of this file.
+"""What may be said of an unlearned policy: one of four phrases, each with its rule.
 
-Two numbers are compared by their intervals, never by their means, and paired: the same episodes, or the same seeds.
+Two numbers are compared by their intervals, never by their means, and paired: the same episodes, or the same seeds. The
+rules read clip by clip: a group's mean can hide a clip that was lost or still known.
 
 The control decides what forgotten means. A policy that never saw a target does a part of it all the same: it knows the
 reference, most of a punch is standing, and with residual actions the joint controllers move the arms alone. On the G1
@@ -11,59 +12,51 @@ every retrained policy. So a number at most 20 %, or one that is at most `ALIKE`
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 
-import msgspec
-import numpy as np
-
-from forgetmimic_jax.attacks.document import CONTROL, Compared, Curve, EvidenceDocument, Numbers, Relearning
+from forgetmimic_jax.attacks.document import CONTROL, Compared, EvidenceDocument, NearDuplicates, Numbers, Originals
+from forgetmimic_jax.attacks.pace import CLOSE, FASTER, pace
+from forgetmimic_jax.evaluation.document import PolicyResult
 from forgetmimic_jax.evaluation.metrics import UNLEARNED
-from forgetmimic_jax.evaluation.relearning import DECISIVE, Lasted, lasted
-from forgetmimic_jax.evaluation.tables import FORGOTTEN, KEPT, KEPT_CLIP, number
-from forgetmimic_jax.evaluation.verdict import (
-    ALIKE,
-    CONSISTENT,
-    FAILED,
-    FASTER,
-    INCONCLUSIVE,
-    RECOVERABLE,
-    Skill,
-    Verdict,
-    as_skill,
-    below_baseline,
-    bound,
-    by_clip,
-    losses,
-    pace_over_seeds,
-    retained,
-    sooner_than_control,
-    steps_in_words,
-)
+from forgetmimic_jax.evaluation.relearning import DECISIVE
+from forgetmimic_jax.evaluation.skill import Skill, as_skill, by_clip, retained
+from forgetmimic_jax.evaluation.tables import FORGOTTEN, KEPT, KEPT_CLIP, number, share
 
+CONSISTENT, RECOVERABLE = "consistent with retraining", "suppressed but recoverable"
+INCONCLUSIVE, FAILED = "inconclusive", "failed"
+
+# Closer than this share of (base − zero action) on a target, two policies do the same there: as for `FORGOTTEN`, so
+# little skill counts as none. On the G1 distilled policies of three seeds differ by up to 0.09 on a target, and their
+# intervals come on top, so that a smaller share would separate retrained policies from each other. It is a share, since
+# a difference in tracking that is little on an easy clip is all of the skill on a hard one.
+ALIKE = 0.2
+BELOW = -0.005  # a skill that is less than 0 %, also when it is rounded: below the zero-action baseline
 RECOVERED = 0.1  # above the control, or above the policy before: a recovery of more than this counts
 
 Marks = Mapping[str, Compared]
 
 
 _FORGOTTEN = (
-    f"on every target and on every family of near-duplicates, the policy retains at most {bound(FORGOTTEN)} of the "
-    f"base's skill, or at most {bound(ALIKE)} more than the control does in the same episodes; the same holds for "
+    f"on every target and on every family of near-duplicates, the policy retains at most {share(FORGOTTEN)} of the "
+    f"base's skill, or at most {share(ALIKE)} more than the control does in the same episodes; the same holds for "
     f"motion content ({FORGOTTEN:g}, {ALIKE:g})"
 )
 _KEPT = (
-    f"it retains at least {bound(KEPT_CLIP)} of the skill on every kept clip and {bound(KEPT)} on average, and on "
-    f"every family of the kept clips' near-duplicates at least {bound(KEPT_CLIP)}, or at most {bound(ALIKE)} less "
+    f"it retains at least {share(KEPT_CLIP)} of the skill on every kept clip and {share(KEPT)} on average, and on "
+    f"every family of the kept clips' near-duplicates at least {share(KEPT_CLIP)}, or at most {share(ALIKE)} less "
     f"than the control"
 )
+NOT_ATTACKED = "Nothing was tried to bring the targets back: `make evidence` does."
 _NO_SKILL = "The base itself is hardly better than the zero-action baseline on every {}: no skill is defined."
 RULES = {
     CONSISTENT: (
         f"Forgotten: {_FORGOTTEN}. Kept: {_KEPT}. Not recovered: fine-tuned on the kept clips alone, its skill and its "
         f"motion content on the targets are at most {RECOVERED:g} above the control's after the same training; with "
         f"other numerics at most {RECOVERED:g} above its own before; and with every seed it needs at least "
-        f"{bound(FASTER)} of the control's target steps to relearn {bound(DECISIVE)} of the base's tracking, or "
-        f"tracks at most {bound(ALIKE)} of the base's more after the same target steps where neither gets there. All "
+        f"{share(FASTER)} of the control's target steps to relearn {share(DECISIVE)} of the base's tracking, or "
+        f"tracks at most {share(CLOSE)} of the base's more after the same target steps where neither gets there. All "
         f"of this holds for whole 95 % intervals. The control never rolled out a target clip, and keeps at least "
-        f"{bound(KEPT)} of the kept clips' skill."
+        f"{share(KEPT)} of the kept clips' skill."
     ),
     RECOVERABLE: (
         "Not failed, but an attack brought the targets back: one of the three comparisons of 'not recovered' is on the "
@@ -74,37 +67,29 @@ RULES = {
         "None of the other rules holds: an interval includes a bound, a comparison was not measured, or the policy is "
         "below the zero-action baseline on a target, with its whole interval: no retrained policy is."
     ),
-    FAILED: "With its whole interval a number of 'forgotten' or of 'kept' is on the other side of all of its bounds.",
+    FAILED: (
+        f"With its whole interval a number of 'forgotten' or of 'kept' is on the other side of all of its bounds. "
+        f"Without a control, {share(FORGOTTEN)} is the only bound of 'forgotten'."
+    ),
 }
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """One of the four phrases, and why."""
+
+    phrase: str
+    reasons: tuple[str, ...]
 
 
 def judge(evidence: EvidenceDocument) -> Verdict:
     """The verdict on the policy `unlearned`, with every reason."""
     originals, near = evidence.originals, evidence.near_duplicates
-    kept = _skills(originals.kept)
-    failures, doubts = losses(kept) if kept else ([], [_NO_SKILL.format("kept clip")])
-    groups: dict[str, Marks] = {"the target": originals.targets}
-    if near is not None:
-        groups["near-duplicates of the targets:"] = near.families
-    for what, marks in groups.items():
-        for name, numbers in _numbers(marks):
-            for kind in ("skill", "content"):
-                known, words = still_known(numbers, kind)
-                if known:
-                    failures.append(f"Still known: {what} {name}, {words}.")
-                elif known is None:
-                    doubts.append(f"Whether this is forgotten is not sure: {what} {name}, {words}.")
-    for family, numbers in _numbers({} if near is None else near.kept):
-        lost, words = is_lost(numbers)
-        if lost:
-            failures.append(f"Lost: near-duplicates of the kept clips: {family}, {words}.")
-        elif lost is None:
-            doubts.append(f"Whether this is kept is not sure: near-duplicates of the kept clips: {family}, {words}.")
-    if not any(as_skill(numbers.skill) for _, numbers in _numbers(originals.targets)):
-        doubts.append(_NO_SKILL.format("target"))
-    doubts += _over_forgotten(originals.targets)
+    failures, doubts = _of_clips(originals)
     if near is None:
         doubts.append("Near-duplicates were not measured.")
+    else:
+        _of_near_duplicates(near, failures, doubts)
     if failures:
         return Verdict(FAILED, tuple(failures))
 
@@ -116,17 +101,82 @@ def judge(evidence: EvidenceDocument) -> Verdict:
     passed: list[str] = []
     for brought_back, words in recoveries(evidence, usable):
         (recovered if brought_back else unsure if brought_back is None else passed).append(words)
-    remarks = _remarks(evidence)
+    remarks = [*_undefined(originals), *_dropped(near)]
     if recovered:
         return Verdict(RECOVERABLE, (*recovered, *doubts, *unsure, *remarks))
     if doubts or unsure:
         return Verdict(INCONCLUSIVE, (*doubts, *unsure, *remarks))
-    forgotten = by_clip(_skills(originals.targets))
-    found = [
-        f"The targets and their near-duplicates are forgotten ({forgotten} of the base's skill), and the kept clips "
-        f"are kept ({retained(kept)} on average)."
-    ]
-    return Verdict(CONSISTENT, (*found, *passed, *remarks))
+    return Verdict(CONSISTENT, (_found("The targets and their near-duplicates", originals), *passed, *remarks))
+
+
+def judge_evaluation(policy: PolicyResult) -> Verdict:
+    """The verdict on an unlearned policy that nothing has attacked: failed, or inconclusive.
+
+    Args:
+        policy: `unlearned` of an evaluation.json.
+    """
+
+    def numbers(target: bool) -> dict[str, Compared]:
+        clips = {name: clip for name, clip in policy.clips.items() if clip.target == target}
+        return {name: {UNLEARNED: Numbers(skill=clip.skill)} for name, clip in clips.items()}
+
+    originals = Originals(targets=numbers(True), together={}, kept=numbers(False))
+    failures, doubts = _of_clips(originals)
+    if failures:
+        return Verdict(FAILED, tuple(failures))
+    found = doubts or [_found("On these episodes the targets", originals)]
+    return Verdict(INCONCLUSIVE, (*found, NOT_ATTACKED, *_undefined(originals)))
+
+
+def _of_clips(originals: Originals) -> tuple[list[str], list[str]]:
+    """Why the clips as they are say that the policy failed, and what they leave in doubt."""
+    kept, targets = _skills(originals.kept), _skills(originals.targets)
+    failures, doubts = losses(kept) if kept else ([], [_NO_SKILL.format("kept clip")])
+    _of_targets("the target", originals.targets, failures, doubts)
+    if not targets:
+        doubts.append(_NO_SKILL.format("target"))
+    below = {clip: skill for clip, skill in targets.items() if skill.high < BELOW}
+    if below:
+        doubts.append(f"Over-forgotten: below the zero-action baseline ({by_clip(below)} of the base's skill).")
+    return failures, doubts
+
+
+def _of_targets(what: str, marks: Marks, failures: list[str], doubts: list[str]) -> None:
+    """Add what is still known, and what may be."""
+    for name, numbers in _numbers(marks):
+        for kind in ("skill", "content"):
+            known, words = still_known(numbers, kind)
+            if known:
+                failures.append(f"Still known: {what} {name}, {words}.")
+            elif known is None:
+                doubts.append(f"Whether this is forgotten is not sure: {what} {name}, {words}.")
+
+
+def _of_near_duplicates(near: NearDuplicates, failures: list[str], doubts: list[str]) -> None:
+    """The same of the families of near-duplicates, and which of the kept clips' were lost."""
+    _of_targets("near-duplicates of the targets:", near.families, failures, doubts)
+    for family, numbers in _numbers(near.kept):
+        lost, words = is_lost(numbers)
+        if lost:
+            failures.append(f"Lost: near-duplicates of the kept clips: {family}, {words}.")
+        elif lost is None:
+            doubts.append(f"Whether this is kept is not sure: near-duplicates of the kept clips: {family}, {words}.")
+
+
+def losses(kept: Mapping[str, Skill]) -> tuple[list[str], list[str]]:
+    """Which kept clips were lost, one by one and on average, and which an interval leaves in doubt."""
+    failures, doubts = [], []
+    for clip, skill in kept.items():
+        if skill.high < KEPT_CLIP:
+            failures.append(f"Lost: the kept clip {clip}, {skill} of the base's skill.")
+        elif skill.low < KEPT_CLIP:
+            doubts.append(f"Whether this is kept is not sure: the kept clip {clip}, {skill} of the base's skill.")
+    together = retained(kept)
+    if together.high < KEPT:
+        failures.append(f"Lost: the kept clips on average, {together} of the base's skill.")
+    elif together.low < KEPT:
+        doubts.append(f"Whether this is kept is not sure: the kept clips on average, {together} of the base's skill.")
+    return failures, doubts
 
 
 def still_known(numbers: Numbers, kind: str) -> tuple[bool | None, str]:
@@ -168,7 +218,7 @@ def recoveries(evidence: EvidenceDocument, no_control: str = "") -> Iterator[tup
         yield None, "So retain-only recovery and relearning have nothing to be compared with."
     else:
         yield from _recovery(evidence)
-        yield _pace(evidence.relearning)
+        yield pace(evidence.relearning)
     if evidence.numerics is None:
         yield None, "Other numerics were not measured."
         return
@@ -195,49 +245,6 @@ def _rises(numbers: Numbers, attack: str, other: str) -> Iterator[tuple[bool | N
         yield rose, f"{attack}: {_words(kind, own)} on the targets, {_signed(kind, above)} above {other}."
 
 
-def _pace(relearning: Relearning | None) -> tuple[bool | None, str]:
-    """Whether it relearns the targets faster than the control, with every seed; None where that is not sure."""
-    if relearning is None:
-        return None, "How fast it relearns the targets was not measured."
-    pairs, faster, short = paired(relearning), [], []
-    for seed, pair in pairs.items():
-        if any(run.there for run in pair):
-            faster.append(sooner_than_control(*pair))
-            continue
-        ours, theirs = reached(relearning, seed)
-        faster.append(ours > theirs + ALIKE)
-        short.append(f"{bound(ours)} against {bound(theirs)}")
-    words = f"{steps_in_words(pairs)} until {bound(DECISIVE)} of the base's tracking"
-    words += f"; after the same target steps neither got there: {', '.join(short)}" if short else ""
-    return pace_over_seeds(faster, words)
-
-
-def reached(relearning: Relearning, seed: str) -> tuple[float, float]:
-    """What unlearned policy and control track of the targets after equally many target steps, as shares of the base's.
-
-    Both are taken where the shorter of the two trainings ended.
-    """
-    ours, theirs = relearning.starts[UNLEARNED][seed], relearning.starts[CONTROL][seed]
-    end = min(ours.target_steps[-1], theirs.target_steps[-1])
-
-    def share(curve: Curve) -> float:
-        return float(np.interp(end, curve.target_steps, curve.tracking) / relearning.base[seed])
-
-    return share(ours), share(theirs)
-
-
-def paired(relearning: Relearning) -> dict[str, tuple[Lasted, Lasted]]:
-    """By seed, how long the unlearned policy and the control took to relearn the targets."""
-    runs = lasted_until(relearning, DECISIVE)
-    return {seed: (run, runs[CONTROL][seed]) for seed, run in runs[UNLEARNED].items() if seed in runs[CONTROL]}
-
-
-def lasted_until(relearning: Relearning, share: float) -> dict[str, dict[str, Lasted]]:
-    """How long the unlearned policy and the control took to a share of the base's tracking: policy → seed → run."""
-    results = msgspec.to_builtins(relearning)
-    return {start: lasted(results, start, share) for start in (UNLEARNED, CONTROL)}
-
-
 def _control_is_usable(evidence: EvidenceDocument) -> str:
     """Why the control cannot be compared with; empty if it can."""
     kept = _skills(evidence.originals.kept, CONTROL)
@@ -246,22 +253,27 @@ def _control_is_usable(evidence: EvidenceDocument) -> str:
     together = retained(kept)
     if together.low >= KEPT:
         return ""
-    return f"The control retains {together} of the kept clips' skill on average; a control needs {bound(KEPT)}."
+    return f"The control retains {together} of the kept clips' skill on average; a control needs {share(KEPT)}."
 
 
-def _over_forgotten(targets: Marks) -> list[str]:
-    below = below_baseline(_skills(targets))
-    if not below:
-        return []
-    return [f"Over-forgotten: below the zero-action baseline ({by_clip(below)} of the base's skill)."]
+def _found(what: str, originals: Originals) -> str:
+    """What a policy about which there is no doubt forgot and kept."""
+    forgotten, kept = by_clip(_skills(originals.targets)), retained(_skills(originals.kept))
+    return f"{what} are forgotten ({forgotten} of the base's skill), and the kept clips are kept ({kept} on average)."
 
 
-def _remarks(evidence: EvidenceDocument) -> list[str]:
-    """What no rule decides, but a reader should know."""
-    near = evidence.near_duplicates
-    if near is None or not near.dropped:
-        return []
-    return [f"{len(near.dropped)} near-duplicates were dropped, since the base cannot follow them."]
+def _undefined(originals: Originals) -> Iterator[str]:
+    """Which clips no rule decides on, since their skill is undefined."""
+    marks = {**originals.targets, **originals.kept}
+    clips = [name for name, numbers in _numbers(marks) if as_skill(numbers.skill) is None]
+    if clips:
+        yield f"Not judged, since the base itself is hardly better than the zero-action baseline: {', '.join(clips)}."
+
+
+def _dropped(near: NearDuplicates | None) -> Iterator[str]:
+    """How many near-duplicates no rule decides on."""
+    if near is not None and near.dropped:
+        yield f"{len(near.dropped)} near-duplicates were dropped, since the base cannot follow them."
 
 
 def _numbers(marks: Marks) -> Iterator[tuple[str, Numbers]]:

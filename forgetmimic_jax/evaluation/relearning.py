@@ -1,46 +1,12 @@
-"""When a policy has learned the targets again: the one rule of the relearning study, the claims and the report.
-
-It also defines what the study's JSON says of its policies (`results.origins`). With that the report checks whether the
-curves belong to a run.
-"""
+"""When a policy has learned the targets again: the one rule of the relearning study, the claims and the evidence."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import msgspec
-
-from forgetmimic_jax.evaluation.document import Estimate
-from forgetmimic_jax.settings.config import Config, by_name
-
 LEVELS = (0.5, 0.8, 0.95)  # of the base's tracking on the targets
 DECISIVE = 0.8  # the level that verdicts and claims compare
-# Settings that may differ between runs of one kind: names of files, the seed, and how often a run saves and is watched.
-NEUTRAL = (
-    *("base", "library", "seed", "checkpoint_every", "evaluate_every", "evaluate_episodes"),
-    "physics.engine",
-)
-
-
-class Origin(msgspec.Struct):
-    """How the policies of one start were trained, and how well they do."""
-
-    settings: dict[str, Any]  # see `comparable_settings`
-    kept_skill: dict[str, Estimate]  # by repeat: share of the base's skill that the kept clips retain
-
-
-class Origins(msgspec.Struct):
-    """The policies that relearning started from."""
-
-    bases: list[str]  # `checkpoint.policy_hash` of each base
-    starts: dict[str, Origin]  # unlearned, distilled, retrained
-
-
-def comparable_settings(config: Config) -> dict[str, Any]:
-    """Every setting by its dotted name that two runs of one kind have in common; the order of targets is none."""
-    settings = {name: value for name, value in by_name(config).items() if name not in NEUTRAL}
-    return settings | {"unlearn.targets": sorted(settings["unlearn.targets"])}
 
 
 class Lasted(NamedTuple):

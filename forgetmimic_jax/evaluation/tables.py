@@ -29,9 +29,9 @@ POLICY_ORDER = (BASE, UNLEARNED, "retrained", FINE_TUNED, ZERO_ACTION)
 
 # Shares of the base's skill: a target is forgotten at FORGOTTEN or less, a kept clip is kept at KEPT or more. One clip
 # varies more from training to training than the mean of all: on the G1 three distilled policies retain 93 % of the kept
-# clips' skill on average, and 68, 77 and 81 % on their weakest clip. Below KEPT_CLIP a clip counts as lost.
+# clips' skill on average, and 68, 77 and 81 % on their weakest clip. Below KEPT_CLIP a clip is not kept.
 FORGOTTEN, KEPT, KEPT_CLIP = 0.2, 0.8, 0.5
-COLOURS = {"forgotten": "green", "kept": "green", "still known": "red", "lost": "red"}
+COLOURS = {"forgotten": "green", "kept": "green", "still known": "red", "not kept": "red"}
 
 UNITS = {
     "episode_length": "steps",
@@ -195,7 +195,7 @@ def _result(retained: Estimate | None, role: str) -> str:
         return "not learned"
     if role == "target":
         return "forgotten" if retained.mean <= FORGOTTEN else "still known"
-    return "kept" if retained.mean >= KEPT else "weakened" if retained.mean >= KEPT_CLIP else "lost"
+    return "kept" if retained.mean >= KEPT else "weakened" if retained.mean >= KEPT_CLIP else "not kept"
 
 
 def _group_rows(document: EvaluationDocument, *, digits: int = 3) -> Rows:
@@ -295,8 +295,8 @@ def notes(document: EvaluationDocument) -> list[str]:
         above = " above the baseline" if ZERO_ACTION in document.policies else ""
         lines.append(f"skill: share of the base's tracking{above} that is retained.")
         lines.append(
-            f"result: forgotten at a skill of at most {100 * FORGOTTEN:.0f} %, kept at one of at least "
-            f"{100 * KEPT:.0f} %, not learned where the base itself is hardly better than the baseline."
+            f"result: forgotten at a skill of at most {share(FORGOTTEN)}, kept at one of at least "
+            f"{share(KEPT)}, not learned where the base itself is hardly better than the baseline."
         )
     if unbounded_in_brief(document):
         lines.append(
@@ -329,6 +329,11 @@ def number(value: Estimate | Mapping[str, Any] | None, digits: int = 3, interval
 def percent(value: Estimate | Mapping[str, Any] | None, digits: int = 0, interval: bool = True) -> str:
     """The same in whole per cent."""
     return _cell(value, interval, 0, scale=100.0, unit=" %")
+
+
+def share(value: float) -> str:
+    """A plain number in whole per cent, as `percent` writes it."""
+    return percent({"mean": value})
 
 
 def _cell(value: Estimate | Mapping[str, Any] | None, interval: bool, digits: int, *, scale: float, unit: str) -> str:

@@ -9,11 +9,9 @@ from typing import Any
 
 from forgetmimic_jax import unlearning
 from forgetmimic_jax.basics.provenance import installed, provenance
-from forgetmimic_jax.evaluation.document import Estimate, GroupResult, PolicyResult
+from forgetmimic_jax.evaluation.document import Estimate, GroupResult
 from forgetmimic_jax.evaluation.metrics import BASE, UNLEARNED, ZERO_ACTION
-from forgetmimic_jax.evaluation.relearning import Lasted
 from forgetmimic_jax.evaluation.tables import number, percent
-from forgetmimic_jax.evaluation.verdict import NotMeasured
 from forgetmimic_jax.reporting.subject import Subject
 from forgetmimic_jax.settings.config import SamplingConfig
 from forgetmimic_jax.training.checkpoint import policy_hash
@@ -132,28 +130,12 @@ def _mean_lambda_crit(rows: Sequence[Mapping[str, Any]]) -> float | None:
     return sum(found) / len(found) if found else None
 
 
-def missing(
-    control: PolicyResult | NotMeasured, relearning: Mapping[str, tuple[Lasted, Lasted]] | NotMeasured
-) -> list[str]:
-    """What a run without evidence was not tested for."""
-    facts = [
-        "Not tested: the attacks of `make evidence`, such as near-duplicates of the targets, fine-tuning on the kept "
-        "clips alone, and whether the policy shows that the targets were once in its library (membership inference)."
-    ]
-    facts += [comparison.reason for comparison in (control, relearning) if isinstance(comparison, NotMeasured)]
-    if not isinstance(relearning, NotMeasured):
-        facts.append(
-            "Relearning was measured on the study's own unlearned policies, trained as this one with other seeds."
-        )
-    return facts
-
-
-def limits(subject: Subject, missing: Sequence[str]) -> list[str]:
+def limits(subject: Subject, *, attacked: bool) -> list[str]:
     """What the page does not show.
 
     Args:
         subject: the run.
-        missing: what was not tested.
+        attacked: whether it has evidence.
     """
     facts = [
         "Everything is simulation. Nothing here was run on a robot.",
@@ -162,8 +144,13 @@ def limits(subject: Subject, missing: Sequence[str]) -> list[str]:
         "There is one training seed. The intervals say how well this checkpoint was measured, not what another "
         "training would give.",
         "Not tested: pushes, sensor noise, other floors, and clips outside the library.",
-        *missing,
     ]
+    if not attacked:
+        facts.append(
+            "Not tested: the attacks of `make evidence`, such as near-duplicates of the targets, fine-tuning on the "
+            "kept clips alone, and whether the policy shows that the targets were once in its library (membership "
+            "inference)."
+        )
     base = subject.document.policies[BASE].target
     success = base.success_rate if base else None
     if success and success.mean is not None and success.mean < 0.5:

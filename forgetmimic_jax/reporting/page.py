@@ -10,8 +10,8 @@ from typing import Any
 import jinja2
 from markupsafe import Markup
 
+from forgetmimic_jax.attacks.verdict import Verdict
 from forgetmimic_jax.evaluation import plots, tables
-from forgetmimic_jax.evaluation.verdict import Verdict
 from forgetmimic_jax.reporting.facts import listed
 from forgetmimic_jax.reporting.subject import Subject
 

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from forgetmimic_jax.attacks.document import FILE as EVIDENCE
+from forgetmimic_jax.attacks.document import EvidenceDocument, read_evidence
 from forgetmimic_jax.basics.console import command_line
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.basics.files import read_rows
@@ -63,3 +65,20 @@ def read_subject(run: Path, base: Path | None) -> Subject:
         )
     rows = [row for row in read_rows(run / "metrics.jsonl") if "target/step_share" in row]
     return Subject(run, document, info, base_info, rows)
+
+
+def read_own_evidence(subject: Subject) -> EvidenceDocument | None:
+    """The evidence in the run's folder, if there is any.
+
+    Raises:
+        InputError: it is of another policy.
+    """
+    path = subject.run / EVIDENCE
+    if not path.is_file():
+        return None
+    evidence = read_evidence(path)
+    for name, info in ((UNLEARNED, subject.info), (BASE, subject.base)):
+        found, ours = evidence.policy_hashes.get(name), policy_hash(info)
+        if found != ours:
+            raise InputError(f"{path}: policy_hashes.{name}: found {found}; accepted: {ours}, as in the unlearned run")
+    return evidence

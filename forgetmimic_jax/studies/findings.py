@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from forgetmimic_jax.evaluation.tables import FORGOTTEN, percent
+from forgetmimic_jax.evaluation.tables import FORGOTTEN, percent, share
 from forgetmimic_jax.studies.claim import Finding, finding
 from forgetmimic_jax.studies.variants import estimates, mean_gained, within
 
@@ -38,11 +38,6 @@ def kept_stay(
         whose = "the control's" if other else "the base's"
         evidence = f"success on the kept clips minus {whose} {percent(change)}; bound {share(-POINTS)}"
         yield finding(claim, change, -POINTS, evidence, below=False, main=main)
-
-
-def share(value: float) -> str:
-    """A share in whole per cent, as `percent` writes it."""
-    return f"{100 * value:.0f} %"
 
 
 def forgotten_and_kept(variants: Mapping[str, Any]) -> str:

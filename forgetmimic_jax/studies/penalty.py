@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.evaluation.plots import curve, new_figure
 from forgetmimic_jax.evaluation.repeats import over_repeats
-from forgetmimic_jax.evaluation.tables import FORGOTTEN, number
+from forgetmimic_jax.evaluation.tables import FORGOTTEN, number, share
 from forgetmimic_jax.studies import paper
 from forgetmimic_jax.studies.claim import Between, Finding, finding_between
-from forgetmimic_jax.studies.findings import SUCCESS, share
+from forgetmimic_jax.studies.findings import SUCCESS
 from forgetmimic_jax.studies.study import ITERATIONS, Document, Study, variants_study
 from forgetmimic_jax.studies.variants import TRACKING, estimates, variant_table
 

@@ -46,7 +46,6 @@ def find_controls(
         InputError: one that is named is of other clips, or rolled out a target.
     """
     from forgetmimic_jax.attacks.control import check_never_rolled_out
-    from forgetmimic_jax.evaluation.relearning import comparable_settings
     from forgetmimic_jax.training.checkpoint import read_info
     from forgetmimic_jax.training.start import shipped_policies
 
@@ -59,7 +58,7 @@ def find_controls(
         raise InputError(f"--controls: found {len(infos)}; accepted: one for each base at most, here {len(bases)}")
     _check_alike(infos, bases[0])
     for info in infos:
-        check_never_rolled_out(str(info.path), comparable_settings(info.config), targets)
+        check_never_rolled_out(info, targets)
     return infos
 
 

@@ -3,8 +3,7 @@
 import pytest
 from invented_evidence import compared, curve, estimate, evidence, numbers
 
-from forgetmimic_jax.attacks.verdict import RULES, judge
-from forgetmimic_jax.evaluation.verdict import CONSISTENT, FAILED, INCONCLUSIVE, RECOVERABLE
+from forgetmimic_jax.attacks.verdict import CONSISTENT, FAILED, INCONCLUSIVE, RECOVERABLE, RULES, judge
 
 
 def test_a_policy_that_no_attack_brings_back_is_consistent():
@@ -40,11 +39,11 @@ def test_what_the_control_does_too_is_forgotten():
         ),
         (
             {"originals__kept__walk": compared(0.1, 0.9), "originals__kept__run": compared(1.0, 0.9)},
-            "The kept clip walk was lost: 10 %",
+            "Lost: the kept clip walk, 10 %",
         ),
         (
             {"originals__kept": {clip: compared(0.7, 0.9) for clip in ("walk", "run")}},
-            "The kept clips were not kept: 70 %",
+            "Lost: the kept clips on average, 70 %",
         ),
         (
             {"near_duplicates__kept__speed": compared(0.0, 0.85)},

@@ -14,8 +14,7 @@ from forgetmimic_jax.attacks import case as cases
 from forgetmimic_jax.attacks import fakes, look_alikes, membership, near_duplicates, numerics, splices
 from forgetmimic_jax.attacks.case import Case, Scale, originals
 from forgetmimic_jax.attacks.document import EvidenceDocument, Recovery, Relearning
-from forgetmimic_jax.attacks.verdict import judge
-from forgetmimic_jax.evaluation.verdict import CONSISTENT, FAILED, Verdict
+from forgetmimic_jax.attacks.verdict import CONSISTENT, FAILED, Verdict, judge
 from forgetmimic_jax.tracking.layouts import find_layout
 
 SCALE = Scale(episodes=6, target_episodes=6, variant_episodes=4, kept_variant_episodes=4)

@@ -13,9 +13,9 @@ from miniature import finished
 from PIL import Image
 
 from forgetmimic_jax import report, unlearn
+from forgetmimic_jax.attacks.verdict import NOT_ATTACKED, RULES
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.basics.provenance import provenance
-from forgetmimic_jax.evaluation.verdict import RULES
 from forgetmimic_jax.reporting import films
 from forgetmimic_jax.reporting.facts import done
 from forgetmimic_jax.reporting.subject import read_subject
@@ -93,8 +93,7 @@ def test_the_page_tells_what_was_asked_done_and_found(page, run, base_run):
         policy_hash(read_info(base_run.checkpoint(4))),
         read_info(base_run.checkpoint(4)).library_hash,
         "Everything is simulation.",
-        "How fast it relearns the targets was not measured.",
-        "It was not compared with a control that never rolled out a target clip.",
+        "Not tested: the attacks of `make evidence`, such as",
         f"Evaluation made with</th><td>code {provenance().commit}, jax ",
         "λ_crit = W (1 + R_reg / R_track)",
     ):
@@ -155,7 +154,9 @@ def test_the_tables_are_those_of_the_evaluation(page, run):
 
 
 def test_the_facts_lie_beside_it(facts, run):
-    assert facts["verdict"]["phrase"] in RULES
+    verdict = facts["verdict"]
+    assert verdict["phrase"] in RULES
+    assert verdict["phrase"] == "failed" or NOT_ATTACKED in verdict["reasons"]
     assert facts["rules"] == RULES
     assert facts["evaluation"] == json.loads((run / "evaluation.json").read_text())
     assert facts["done"]["Penalty"] == "16"
@@ -232,8 +233,6 @@ def test_without_a_training_log_there_are_no_curves(run, tmp_path):
         ({"films": -1}, "--films: found -1; accepted: 0 or more"),
         ({"output": Path("report.pdf")}, "--output: found report.pdf; accepted: an .html file"),
         ({"output": Path(__file__) / "r.html"}, f"{__file__}: {__file__} is a file; choose another --output"),
-        ({"control": Path("nowhere")}, "nowhere/config.yaml: no such config"),
-        ({"relearning": Path("nowhere.json")}, "nowhere.json: not found"),
     ],
 )
 def test_what_cannot_be_is_told_in_one_line(refused, run, given, message):

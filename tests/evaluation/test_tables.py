@@ -18,7 +18,7 @@ def policy(target: bool, skill: float | None) -> PolicyResult:
     ("target", "skill", "word"),
     [
         *((True, -0.3, "forgotten"), (True, 0.2, "forgotten"), (True, 0.21, "still known"), (True, 0.9, "still known")),
-        *((False, 0.8, "kept"), (False, 0.79, "weakened"), (False, 0.5, "weakened"), (False, 0.49, "lost")),
+        *((False, 0.8, "kept"), (False, 0.79, "weakened"), (False, 0.5, "weakened"), (False, 0.49, "not kept")),
         *((True, None, "not learned"), (False, None, "not learned")),
     ],
 )

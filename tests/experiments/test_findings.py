@@ -15,10 +15,10 @@ from experiments import (
     training_dynamics,
     validity,
 )
+from forgetmimic_jax.attacks.pace import sooner_than_control
 from forgetmimic_jax.evaluation.relearning import Lasted
 from forgetmimic_jax.evaluation.repeats import Repeat
 from forgetmimic_jax.evaluation.statistics import over_seeds
-from forgetmimic_jax.evaluation.verdict import sooner_than_control
 from forgetmimic_jax.studies import claim, penalty, samplers, targets
 from forgetmimic_jax.studies.findings import mean_gained
 from forgetmimic_jax.studies.variants import DEVIATION
@@ -350,9 +350,8 @@ GOOD = {"mean": 0.9, "low": 0.85, "n": 9}  # of the kept clips' skill
 def relearning_results(starts: dict, kept: float = 0.9) -> dict:
     """The study's JSON with controls that retain so much of the kept clips' skill, at the least."""
     skill = {"mean": kept + 0.05, "low": kept, "high": kept + 0.1, "n": 200}
-    origins = {label: {"settings": {}, "kept_skill": dict.fromkeys(REPEATS, skill)} for label in starts}
     base = dict.fromkeys(REPEATS, 0.9)
-    return {"base": base, "starts": starts, "origins": {"bases": ["b"], "starts": origins}}
+    return {"base": base, "starts": starts, "kept_skill": {label: dict.fromkeys(REPEATS, skill) for label in starts}}
 
 
 @pytest.mark.parametrize(
@@ -458,11 +457,11 @@ def test_a_control_that_lost_the_kept_clips_decides_nothing():
     assert relearning.answer({"results": poor}).endswith("on them: unusable (distilled, kept skill 84 % [79, 89]).")
     assert relearning.competent(relearning_results(starts, kept=0.8), "distilled") == REPEATS
     # One of three that is unusable leaves two, of which the words speak.
-    poor["origins"]["starts"]["distilled"]["kept_skill"] |= {of: GOOD for of in REPEATS[1:]}
+    poor["kept_skill"]["distilled"] |= {of: GOOD for of in REPEATS[1:]}
     found = list(relearning.findings({"results": poor}))[1]
     assert (found.n, found.main) == (2, True)
     assert found.evidence.endswith("; 1 more distilled unusable")
-    del poor["origins"]
+    del poor["kept_skill"]
     assert "distilled: unknown of the kept clips' skill" in next(iter(relearning.findings({"results": poor}))).evidence
 
 
@@ -472,8 +471,7 @@ def test_a_retrained_policy_beside_one_of_three_bases_is_one_run_and_a_run_that_
     starts["distilled"] = dict(zip(repeats, map(curve, (4, 9, 9)), strict=True))
     results = relearning_results(starts)
     results["base"] = dict.fromkeys(repeats, 0.9)
-    for of in results["origins"]["starts"].values():
-        of["kept_skill"] = {repeat: GOOD for repeat in repeats}
+    results["kept_skill"] = {label: dict.fromkeys(repeats, GOOD) for label in starts}
     found = {(of.claim.split()[-3], of.main): of for of in relearning.findings({"results": results})}
     assert (found["retrained", True].word, found["retrained", True].n) == ("one run: no", 1)
     assert (found["distilled", True].n, found["distilled", True].unit) == (3, "base")

@@ -123,9 +123,9 @@ AT_START = {
 
 
 @pytest.fixture
-def _no_origins(monkeypatch):
-    """Without the settings and evaluations of the runs that trained the starts, which no stand-in has."""
-    monkeypatch.setattr(relearning, "origins", lambda lab, folders: sorted(map(str, folders)))
+def _no_skills(monkeypatch):
+    """Without the evaluations of the runs that trained the starts, which no stand-in has."""
+    monkeypatch.setattr(relearning, "measured_skills", lambda folders: sorted(map(str, folders)))
 
 
 class Relearned(StandIn):
@@ -154,7 +154,7 @@ class Relearned(StandIn):
         return folders
 
 
-@pytest.mark.usefixtures("_no_origins")
+@pytest.mark.usefixtures("_no_skills")
 def test_relearning_starts_from_each_policy_and_its_levels_are_the_bases(tmp_path):
     lab = Relearned(tmp_path)
     found = relearning.measure(lab)
@@ -176,7 +176,7 @@ def test_relearning_starts_from_each_policy_and_its_levels_are_the_bases(tmp_pat
         assert curve["target_steps"] == pytest.approx(steps[-len(curve["tracking"]) :])
 
 
-@pytest.mark.usefixtures("_no_origins")
+@pytest.mark.usefixtures("_no_skills")
 def test_whatever_the_start_relearning_is_on_all_clips_half_on_targets_and_free_of_any_base(tmp_path):
     lab = Relearned(tmp_path)
     relearning.measure(lab)
