@@ -18,6 +18,9 @@ from forgetmimic_jax.tracking.setup import Setup
 QUICK_COMPILATION = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICK_COMPILATION}".strip()
 
+# What one test compiled, another one takes from the cache; a worker of its own compiles no less than this one.
+os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
+
 # As under `make test`, also without make: what a command says to do next is then a target of make.
 os.environ["MAKELEVEL"] = "1"
 

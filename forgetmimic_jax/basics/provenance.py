@@ -7,6 +7,7 @@ import functools
 import hashlib
 import os
 import platform
+import re
 import subprocess
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
@@ -88,22 +89,34 @@ def installed(package: str) -> str:
 
 def processor() -> str:
     """Name of the processor."""
+    return _of_the_processor("model name") or platform.processor() or platform.machine()
+
+
+def compiled_for() -> str:
+    """What a compiled program depends on besides its code: the processor, its instructions, the number of cores."""
+    instructions = hashlib.sha256(_of_the_processor("flags").encode()).hexdigest()[:8]
+    name = "-".join(re.findall(r"\w+", processor()))
+    return f"{name}-{instructions}-{_schedulable()}-cores"
+
+
+def _of_the_processor(field: str) -> str:
+    """A field of Linux's description of the first core; empty where there is none."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
-        lines = []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
+        return ""
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith(field)), "")
 
 
 def cores() -> int:
     """How many cores this process may use; `PYTHON_CPU_COUNT` sets it, as Python itself does from 3.13 on."""
     given = os.environ.get("PYTHON_CPU_COUNT", "")
-    if given.isdigit() and int(given):
-        return int(given)
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return int(given) if given.isdigit() and int(given) else _schedulable()
+
+
+def _schedulable() -> int:
+    """How many cores the system gives this process, whatever it was told to use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _git(folder: Path, *arguments: str) -> str | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -31,6 +30,8 @@ class ImpactBatch(HostBatch):
 
     An impact lasts some 10 ms, less than a control step.
     """
+
+    seen = 5
 
     def __init__(self, robot: Robot, substeps: int, num_envs: int, num_threads: int):
         super().__init__(robot, substeps, num_envs, num_threads)
@@ -79,7 +80,6 @@ class ImpactEngine(NativeEngine):
 
     def __init__(self, robot: Robot, substeps: int, num_envs: int):
         super().__init__(with_every_contact(robot), substeps, num_envs)
-        self._seen_shapes = (jax.ShapeDtypeStruct((num_envs,), jnp.float32),) * 5
 
     def step(
         self, state: PhysicsState, parameters: PhysicsParameters, joint_target: Array, wrench: Array

@@ -1,11 +1,9 @@
-"""MuJoCo's C engine on all CPU cores (`mujoco.batch`) behind a pure callback: the default engine on a CPU."""
+"""MuJoCo's C engine on all CPU cores (`mujoco.batch`) as a function of the host: the default engine on a CPU."""
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import queue
-from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +21,7 @@ from forgetmimic_jax.physics.engine import (
     body_state,
     contact_sensor_columns,
 )
+from forgetmimic_jax.physics.host_call import Function, HostFunction
 from forgetmimic_jax.robot.model import Robot
 
 VELOCITY_STAGE = int(mujoco.mjtStage.mjSTAGE_VEL)
@@ -30,6 +29,8 @@ VELOCITY_STAGE = int(mujoco.mjtStage.mjSTAGE_VEL)
 
 class HostBatch:
     """A `mujoco.batch.Batch` whose rows are only scratch: every call, one at a time, loads the state it is given."""
+
+    seen = 0  # further results of a control step, each [env]
 
     def __init__(self, robot: Robot, substeps: int, num_envs: int, num_threads: int):
         model = copy.copy(robot.model)
@@ -50,9 +51,9 @@ class HostBatch:
         self._friction = self._batch.expand("geom_friction")
         self._body_ipos = self._batch.expand("body_ipos")
 
-    def step(self, arguments) -> tuple[np.ndarray, ...]:
+    def step(self, *arguments: np.ndarray) -> tuple[np.ndarray, ...]:
         """A control step of all rows."""
-        *loaded, joint_target, wrench = (np.asarray(x) for x in arguments)
+        *loaded, joint_target, wrench = arguments
         # What overflows float32 has diverged, and shows as infinity: no warning on the user's screen.
         with np.errstate(over="ignore"):
             batch = self._batch
@@ -64,9 +65,9 @@ class HostBatch:
             new = tuple(x.astype(np.float32) for x in (batch.qpos, batch.qvel, batch.qacc_warmstart))
             return (*new, *self._bodies(self._everyone), force, *seen)
 
-    def forward(self, arguments) -> tuple[np.ndarray, ...]:
+    def forward(self, *arguments: np.ndarray) -> tuple[np.ndarray, ...]:
         """The bodies of the rows in a mask, which is the last argument."""
-        *loaded, mask = (np.asarray(x) for x in arguments)
+        *loaded, mask = arguments
         rows = np.flatnonzero(mask)
         if rows.size:
             self._load(rows, *loaded)
@@ -74,7 +75,7 @@ class HostBatch:
         return self._bodies(rows)
 
     def _advance(self) -> tuple[np.ndarray, ...]:
-        """The physics steps of one control step; returns what is to be seen of them, in the engine's `_seen_shapes`."""
+        """The physics steps of one control step; returns what is to be seen of them."""
         self._batch.step(nstep=self._substeps, stage=VELOCITY_STAGE)
         return ()
 
@@ -103,7 +104,7 @@ def body_dims(keys: int) -> tuple[tuple[int, ...], ...]:
 
 
 class NativeEngine:
-    """Batches of MuJoCo's own, behind a callback that is pure: nothing of one call is felt by the next.
+    """Batches of MuJoCo's own as a function of the host that is pure: nothing of one call is felt by the next.
 
     Under `vmap`, as of a whole iteration over several trainings, the members are stepped one after the other. The
     shards of a training step at the same time, each in a batch that no other one uses then, with its own threads.
@@ -129,10 +130,12 @@ class NativeEngine:
             return jax.ShapeDtypeStruct((num_envs, *dims), jnp.float32)
 
         keys = len(robot.key_body_ids)
-        self._state_shapes = (shape(model.nq), shape(model.nv), shape(model.nv))
-        self._body_shapes = tuple(shape(*dims) for dims in body_dims(keys))
-        self._force_shape = shape(keys, 3)
-        self._seen_shapes: tuple[jax.ShapeDtypeStruct, ...] = ()
+        state = (shape(model.nq), shape(model.nv), shape(model.nv))
+        bodies = tuple(shape(*dims) for dims in body_dims(keys))
+        seen = (shape(),) * self.host.seen
+        computes = _description(self.host, robot, substeps, num_envs)
+        self._step = HostFunction(self._on_batch("step"), (*state, *bodies, shape(keys, 3), *seen), b"step" + computes)
+        self._forward = HostFunction(self._on_batch("forward"), bodies, b"forward" + computes)
 
     def step(
         self, state: PhysicsState, parameters: PhysicsParameters, joint_target: Array, wrench: Array
@@ -142,12 +145,8 @@ class NativeEngine:
 
     def forward(self, state: PhysicsState, parameters: PhysicsParameters, mask: Array, bodies: BodyState) -> BodyState:
         """See `Engine.forward`."""
-        xpos, xquat, cvel, com = jax.pure_callback(
-            self._forward,
-            self._body_shapes,
-            (state.qpos, state.qvel, state.warmstart, parameters.foot_friction, parameters.torso_com, mask),
-            vmap_method="sequential",
-        )
+        loaded = (state.qpos, state.qvel, state.warmstart, parameters.foot_friction, parameters.torso_com)
+        xpos, xquat, cvel, com = self._forward(*loaded, mask)
         fresh = body_state(xpos, xquat, cvel, com, jnp.zeros_like(bodies.contact_force))
         return select_rows(mask, fresh, bodies)
 
@@ -155,29 +154,28 @@ class NativeEngine:
         self, state: PhysicsState, parameters: PhysicsParameters, joint_target: Array, wrench: Array
     ) -> tuple[PhysicsState, BodyState, list[Array]]:
         """The results of `Engine.step`, and what the batch saw besides."""
-        shapes = (*self._state_shapes, *self._body_shapes, self._force_shape, *self._seen_shapes)
         loaded = (state.qpos, state.qvel, state.warmstart, parameters.foot_friction, parameters.torso_com)
-        qpos, qvel, warmstart, xpos, xquat, cvel, com, force, *seen = jax.pure_callback(
-            self._step,
-            shapes,
-            (*loaded, joint_target, wrench),
-            vmap_method="sequential",
-        )
+        qpos, qvel, warmstart, xpos, xquat, cvel, com, force, *seen = self._step(*loaded, joint_target, wrench)
         return PhysicsState(qpos, qvel, warmstart), body_state(xpos, xquat, cvel, com, force), seen
 
-    def _step(self, arguments) -> tuple[np.ndarray, ...]:
-        with self._batch() as batch:
-            return batch.step(arguments)
+    def _on_batch(self, method: str) -> Function:
+        """A method of a batch that nobody else uses until it returns."""
+        free = self._free
 
-    def _forward(self, arguments) -> tuple[np.ndarray, ...]:
-        with self._batch() as batch:
-            return batch.forward(arguments)
+        def call(*arguments: np.ndarray) -> tuple[np.ndarray, ...]:
+            batch = free.get()
+            try:
+                return getattr(batch, method)(*arguments)
+            finally:
+                free.put(batch)
 
-    @contextlib.contextmanager
-    def _batch(self) -> Iterator[HostBatch]:
-        """A batch that nobody else uses inside."""
-        batch = self._free.get()
-        try:
-            yield batch
-        finally:
-            self._free.put(batch)
+        return call
+
+
+def _description(host: type[HostBatch], robot: Robot, substeps: int, num_envs: int) -> bytes:
+    """All that a batch's results depend on besides its arguments."""
+    model = np.empty(mujoco.mj_sizeModel(robot.model), np.uint8)
+    mujoco.mj_saveModel(robot.model, None, model)
+    places = (robot.key_body_ids.tolist(), robot.anchor_body_id, robot.foot_geom_ids.tolist())
+    more = (robot.key_bodies, robot.head_geom_ids.tolist(), robot.pairs)
+    return repr((host.__qualname__, substeps, num_envs, *places, *more)).encode() + model.tobytes()

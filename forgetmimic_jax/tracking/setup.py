@@ -10,6 +10,7 @@ import jax
 
 from forgetmimic_jax.basics.errors import InputError, nearest
 from forgetmimic_jax.basics.places import cache_folder
+from forgetmimic_jax.basics.provenance import compiled_for
 from forgetmimic_jax.motion.library import (
     DATA_DIR,
     MotionLibrary,
@@ -47,7 +48,7 @@ def make_setup(config: Config) -> Setup:
     validate(config)
     find_layout(config.observation.layout)
     if not jax.config.values["jax_compilation_cache_dir"]:
-        jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "jax"))
+        jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "jax" / compiled_for()))
     robot = load_robot(config.robot, config.physics, config.action)
     folder = library_folder(config)
     library = load_library(robot, folder, fps=1.0 / config.physics.control_step)
