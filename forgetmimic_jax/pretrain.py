@@ -58,8 +58,9 @@ class Options(train.Options):
     set: Settings = field(default_factory=list)
     """Any other settings, such as pretrain.patience=5."""
     without: str | None = None
-    """Clips to leave out, comma-separated: from a random policy, without an episode of these clips. The result is the
-    retrained control of a run that forgets them (evidence, report and the studies: --control)."""
+    """Clips to leave out, comma-separated: no episode starts from them, and the policy starts from a random one, or from
+    another robot's that left them out too. The result is the retrained control of a run that forgets them (evidence
+    and the studies: --control)."""
     episodes: int = 100
     """Episodes a clip of the evaluation at the end."""
     seeds: int | None = None
@@ -146,7 +147,9 @@ def config_of(options: Options, output: Path) -> Config:
     Raises:
         InputError: a flag that contradicts the run to resume, or settings that the phases cannot work with.
     """
+    from forgetmimic_jax.attacks.control import check_never_rolled_out
     from forgetmimic_jax.settings.config import load_config, preset
+    from forgetmimic_jax.training.checkpoint import read_info
     from forgetmimic_jax.training.start import shipped_base, with_interface_of_base
     from forgetmimic_jax.unlearning.registry import unlearning_config
 
@@ -161,7 +164,7 @@ def config_of(options: Options, output: Path) -> Config:
         base = options.base or (shipped_base(options.robot) if options.library and not without else None)
         base = None if str(base) == "none" else base
         if base and without:
-            raise InputError(f"--base: found {base} with --without; accepted: none, since a base may know those clips")
+            check_never_rolled_out(read_info(Path(base)), without)
         config = override(preset(options.preset), DIFFERENCES[options.preset])
         config = dataclasses.replace(config, evaluate_episodes=EPISODES)
         config = replace_given(config, robot=options.robot, seed=options.seed, library=options.library, base=base)

@@ -40,7 +40,8 @@ def read_control(run: Path, subject: CheckpointInfo, setup: Setup) -> Checkpoint
         raise InputError(f"{run}: no such folder; name a run of distill, retrain or pretrain, or leave it out")
     info = checkpoint.read_info(run)
     check_never_rolled_out(info, subject.config.unlearn.targets)
-    if info.base not in (None, subject.base):
+    taught = methods()[info.config.unlearn.method].start == "taught"
+    if taught and info.base != subject.base:
         raise InputError(f"{run}: base: found {info.base}; accepted: {subject.base}, as in the unlearned run")
     checkpoint.check_matches(info, setup)
     return info

@@ -153,6 +153,8 @@ def test_a_policy_that_was_pretrained_without_the_targets_is_a_control(unlearned
     assert (found.path, found.base, found.config.unlearn.method) == (folder, None, "retrain")
     meta = json.loads((folder / "meta.json").read_text())
     (folder / "meta.json").write_text(json.dumps(meta | {"base": "x"}))
+    assert read_control(folder, info, make_setup(info.config)).base == "x"  # another robot's control
+    save_config(unlearning_config(config, UnlearnConfig(("turn",), "distill")), folder / "config.yaml")
     with pytest.raises(InputError, match=rf"control: base: found x; accepted: {info.base}, as in the unlearned run"):
         read_control(folder, info, make_setup(info.config))
 

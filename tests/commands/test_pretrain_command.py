@@ -1,6 +1,7 @@
 """The command around pretraining: its settings, and what it says before it trains."""
 
 import dataclasses
+import shutil
 from pathlib import Path
 
 import pytest
@@ -10,8 +11,9 @@ from forgetmimic_jax import pretrain
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.motion import quality
 from forgetmimic_jax.motion.library import DATA_DIR
-from forgetmimic_jax.settings.config import Config, load_config, preset, save_config
+from forgetmimic_jax.settings.config import Config, UnlearnConfig, load_config, preset, save_config
 from forgetmimic_jax.tracking.setup import make_setup
+from forgetmimic_jax.unlearning.registry import unlearning_config
 
 PHASES = [*TINY, "evaluate_every=4"]
 
@@ -62,10 +64,18 @@ def test_a_control_is_trained_from_nothing_without_its_clips(library_folder, ref
     assert pretrain.config_of(dataclasses.replace(again, without=None), tmp_path) == found
     with pytest.raises(InputError, match="--without: found turn, but the run to resume has turn,nod; leave the flag"):
         pretrain.config_of(dataclasses.replace(again, without="turn"), tmp_path)
+
+
+def test_a_control_starts_from_no_policy_that_may_know_its_clips(library_folder, refused, tmp_path):
     base = DATA_DIR / "g1" / "base"
-    given = pretrain.Options(library=library_folder, without="turn", base=base)
+    given = pretrain.Options(robot="h2", library=library_folder, without="turn", base=base)
     message = refused(pretrain.main, given)
-    assert message == f"--base: found {base} with --without; accepted: none, since a base may know those clips"
+    assert message == f"{base}: unlearn.method: found none; accepted for a control: distill or retrain"
+    control = Path(shutil.copytree(base, tmp_path / "control"))
+    config = unlearning_config(load_config(base / "config.yaml"), UnlearnConfig(("turn",), "retrain"))
+    save_config(config, control / "config.yaml")
+    found = pretrain.config_of(dataclasses.replace(given, base=control), tmp_path)
+    assert (found.robot, found.base, found.unlearn.targets) == ("h2", str(control), ("turn",))
 
 
 def test_what_the_phases_cannot_work_with_is_told_in_one_line(refused, library_folder):
