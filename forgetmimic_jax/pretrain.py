@@ -58,9 +58,9 @@ class Options(train.Options):
     set: Settings = field(default_factory=list)
     """Any other settings, such as pretrain.patience=5."""
     without: str | None = None
-    """Clips to leave out, comma-separated: no episode starts from them, and the policy starts from a random one, or from
-    another robot's that left them out too. The result is the retrained control of a run that forgets them (evidence
-    and the studies: --control)."""
+    """Clips to leave out, comma-separated: no episode starts from them, and the policy starts from a random one or
+    from another robot's that left them out too. The result is the retrained control of a run that forgets them
+    (evidence and the studies: --control)."""
     episodes: int = 100
     """Episodes a clip of the evaluation at the end."""
     seeds: int | None = None
