@@ -112,8 +112,8 @@ format: .venv/.installed ## put the code in its format
 	.venv/bin/ruff check --fix .
 	.venv/bin/ruff format .
 
-clean: ## remove caches and build leftovers; runs/ and .venv stay
-	rm -rf .pytest_cache .ruff_cache .mypy_cache build *.egg-info
+clean: ## remove caches and build leftovers, also the compiled programs; runs/ and .venv stay
+	rm -rf .pytest_cache .ruff_cache .mypy_cache build *.egg-info "$${XDG_CACHE_HOME:-$$HOME/.cache}/forgetmimic-jax"
 	find forgetmimic_jax tests experiments -name __pycache__ -prune -exec rm -rf {} +
 
 .venv/.installed: requirements.lock pyproject.toml

@@ -4,6 +4,7 @@ import dataclasses
 import os
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -18,8 +19,9 @@ from forgetmimic_jax.tracking.setup import Setup
 QUICK_COMPILATION = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICK_COMPILATION}".strip()
 
-# What one test compiled, another one takes from the cache; a worker of its own compiles no less than this one.
+# What one test compiled, another one takes from the cache, also in a process that a test starts.
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 # As under `make test`, also without make: what a command says to do next is then a target of make.
 os.environ["MAKELEVEL"] = "1"

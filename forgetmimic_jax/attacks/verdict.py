@@ -69,7 +69,7 @@ RULES = {
     ),
     FAILED: (
         f"With its whole interval a number of 'forgotten' or of 'kept' is on the other side of all of its bounds. "
-        f"Without a control, {share(FORGOTTEN)} is the only bound of 'forgotten'."
+        f"Without a control, a number of 'forgotten' fails above {share(FORGOTTEN + ALIKE)}."
     ),
 }
 
@@ -85,21 +85,21 @@ class Verdict:
 def judge(evidence: EvidenceDocument) -> Verdict:
     """The verdict on the policy `unlearned`, with every reason."""
     originals, near = evidence.originals, evidence.near_duplicates
-    failures, doubts = _of_clips(originals)
+    no_control = _why_no_control(originals)
+    failures, doubts = _of_clips(originals, beside=not no_control)
     if near is None:
         doubts.append("Near-duplicates were not measured.")
     else:
-        _of_near_duplicates(near, failures, doubts)
+        _of_near_duplicates(near, failures, doubts, beside=not no_control)
     if failures:
         return Verdict(FAILED, tuple(failures))
 
-    usable = _control_is_usable(evidence)
-    if usable:
-        doubts.append(usable)
+    if no_control:
+        doubts.append(no_control)
     recovered: list[str] = []
     unsure: list[str] = []
     passed: list[str] = []
-    for brought_back, words in recoveries(evidence, usable):
+    for brought_back, words in recoveries(evidence, no_control):
         (recovered if brought_back else unsure if brought_back is None else passed).append(words)
     remarks = [*_undefined(originals), *_dropped(near)]
     if recovered:
@@ -121,18 +121,23 @@ def judge_evaluation(policy: PolicyResult) -> Verdict:
         return {name: {UNLEARNED: Numbers(skill=clip.skill)} for name, clip in clips.items()}
 
     originals = Originals(targets=numbers(True), together={}, kept=numbers(False))
-    failures, doubts = _of_clips(originals)
+    failures, doubts = _of_clips(originals, beside=False)
     if failures:
         return Verdict(FAILED, tuple(failures))
     found = doubts or [_found("On these episodes the targets", originals)]
     return Verdict(INCONCLUSIVE, (*found, NOT_ATTACKED, *_undefined(originals)))
 
 
-def _of_clips(originals: Originals) -> tuple[list[str], list[str]]:
-    """Why the clips as they are say that the policy failed, and what they leave in doubt."""
+def _of_clips(originals: Originals, *, beside: bool) -> tuple[list[str], list[str]]:
+    """Why the clips as they are say that the policy failed, and what they leave in doubt.
+
+    Args:
+        originals: on the policy.
+        beside: whether there is a control to compare with.
+    """
     kept, targets = _skills(originals.kept), _skills(originals.targets)
     failures, doubts = losses(kept) if kept else ([], [_NO_SKILL.format("kept clip")])
-    _of_targets("the target", originals.targets, failures, doubts)
+    _of_targets("the target", originals.targets, failures, doubts, beside=beside)
     if not targets:
         doubts.append(_NO_SKILL.format("target"))
     below = {clip: skill for clip, skill in targets.items() if skill.high < BELOW}
@@ -141,22 +146,22 @@ def _of_clips(originals: Originals) -> tuple[list[str], list[str]]:
     return failures, doubts
 
 
-def _of_targets(what: str, marks: Marks, failures: list[str], doubts: list[str]) -> None:
+def _of_targets(what: str, marks: Marks, failures: list[str], doubts: list[str], *, beside: bool) -> None:
     """Add what is still known, and what may be."""
     for name, numbers in _numbers(marks):
         for kind in ("skill", "content"):
-            known, words = still_known(numbers, kind)
+            known, words = still_known(numbers, kind, beside=beside)
             if known:
                 failures.append(f"Still known: {what} {name}, {words}.")
             elif known is None:
                 doubts.append(f"Whether this is forgotten is not sure: {what} {name}, {words}.")
 
 
-def _of_near_duplicates(near: NearDuplicates, failures: list[str], doubts: list[str]) -> None:
+def _of_near_duplicates(near: NearDuplicates, failures: list[str], doubts: list[str], *, beside: bool) -> None:
     """The same of the families of near-duplicates, and which of the kept clips' were lost."""
-    _of_targets("near-duplicates of the targets:", near.families, failures, doubts)
+    _of_targets("near-duplicates of the targets:", near.families, failures, doubts, beside=beside)
     for family, numbers in _numbers(near.kept):
-        lost, words = is_lost(numbers)
+        lost, words = is_lost(numbers, beside=beside)
         if lost:
             failures.append(f"Lost: near-duplicates of the kept clips: {family}, {words}.")
         elif lost is None:
@@ -179,32 +184,39 @@ def losses(kept: Mapping[str, Skill]) -> tuple[list[str], list[str]]:
     return failures, doubts
 
 
-def still_known(numbers: Numbers, kind: str) -> tuple[bool | None, str]:
+def still_known(numbers: Numbers, kind: str, *, beside: bool) -> tuple[bool | None, str]:
     """Whether a number of the unlearned policy shows a motion: no, yes, or None where that is not sure; in words.
+
+    Without a control a number is sure only where it is more than `ALIKE` above the bound: so much a policy may do that
+    never saw the motion.
 
     Args:
         numbers: of the unlearned policy.
         kind: skill or content; what is undefined shows nothing.
+        beside: whether there is a control to compare with.
     """
-    own, above = as_skill(getattr(numbers, kind)), as_skill(getattr(numbers, f"{kind}_above"))
+    own = as_skill(getattr(numbers, kind))
+    above = as_skill(getattr(numbers, f"{kind}_above")) if beside else None
     if own is None:
         return False, f"{kind} undefined"
     words = _words(kind, own)
     words += f" ({_signed(kind, above)} above the control)" if above else ""
     if own.high <= FORGOTTEN or (above and above.high <= ALIKE):
         return False, words
-    return (True if own.low > FORGOTTEN and (above is None or above.low > ALIKE) else None), words
+    known = own.low > FORGOTTEN and above.low > ALIKE if above else own.low > FORGOTTEN + ALIKE
+    return (True if known else None), words
 
 
-def is_lost(numbers: Numbers) -> tuple[bool | None, str]:
+def is_lost(numbers: Numbers, *, beside: bool) -> tuple[bool | None, str]:
     """Whether the unlearned policy lost the kept clips' near-duplicates of a family; as `still_known`."""
-    own, above = as_skill(numbers.skill), as_skill(numbers.skill_above)
+    own, above = as_skill(numbers.skill), as_skill(numbers.skill_above) if beside else None
     if own is None:
         return False, "skill undefined"
     words = _words("skill", own) + (f" ({_signed('skill', above)} above the control)" if above else "")
     if own.low >= KEPT_CLIP or (above and above.low >= -ALIKE):
         return False, words
-    return (True if own.high < KEPT_CLIP and (above is None or above.high < -ALIKE) else None), words
+    lost = own.high < KEPT_CLIP and above.high < -ALIKE if above else own.high < KEPT_CLIP - ALIKE
+    return (True if lost else None), words
 
 
 def recoveries(evidence: EvidenceDocument, no_control: str = "") -> Iterator[tuple[bool | None, str]]:
@@ -245,9 +257,9 @@ def _rises(numbers: Numbers, attack: str, other: str) -> Iterator[tuple[bool | N
         yield rose, f"{attack}: {_words(kind, own)} on the targets, {_signed(kind, above)} above {other}."
 
 
-def _control_is_usable(evidence: EvidenceDocument) -> str:
+def _why_no_control(originals: Originals) -> str:
     """Why the control cannot be compared with; empty if it can."""
-    kept = _skills(evidence.originals.kept, CONTROL)
+    kept = _skills(originals.kept, CONTROL)
     if not kept:
         return "No skill of the control on the kept clips is defined."
     together = retained(kept)
@@ -263,11 +275,12 @@ def _found(what: str, originals: Originals) -> str:
 
 
 def _undefined(originals: Originals) -> Iterator[str]:
-    """Which clips no rule decides on, since their skill is undefined."""
+    """Whose skill is undefined."""
     marks = {**originals.targets, **originals.kept}
     clips = [name for name, numbers in _numbers(marks) if as_skill(numbers.skill) is None]
     if clips:
-        yield f"Not judged, since the base itself is hardly better than the zero-action baseline: {', '.join(clips)}."
+        where = ", ".join(clips)
+        yield f"No skill is defined, since the base itself is hardly better than the zero-action baseline: {where}."
 
 
 def _dropped(near: NearDuplicates | None) -> Iterator[str]:

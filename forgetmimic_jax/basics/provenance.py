@@ -94,7 +94,8 @@ def processor() -> str:
 
 def compiled_for() -> str:
     """What a compiled program depends on besides its code: the processor, its instructions, the number of cores."""
-    instructions = hashlib.sha256(_of_the_processor("flags").encode()).hexdigest()[:8]
+    told = [_of_the_processor(field) for field in ("flags", "Features", "CPU part")]  # the last two on ARM
+    instructions = hashlib.sha256(repr(told).encode()).hexdigest()[:8]
     name = "-".join(re.findall(r"\w+", processor()))
     return f"{name}-{instructions}-{_schedulable()}-cores"
 

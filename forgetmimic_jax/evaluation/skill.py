@@ -27,7 +27,7 @@ class Skill(NamedTuple):
         return Estimate(self.mean) if self.high == inf else Estimate(*self)
 
     def __str__(self) -> str:
-        return percent(self.estimate)
+        return percent(self.estimate) + (" (too few episodes for an interval)" if self.high == inf else "")
 
 
 def as_skill(estimate: Estimate | None) -> Skill | None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
+import traceback
 import weakref
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -27,6 +28,8 @@ _functions: dict[int, weakref.WeakSet[HostFunction]] = {}
 
 class HostFunction:
     """A pure function of arrays that runs on the host.
+
+    Programs do not keep it: who made it keeps it until they have ended.
 
     Args:
         function: takes the arrays of a call, which it must not keep, and returns as many arrays as `shapes`.
@@ -172,8 +175,8 @@ def _handler(pointer: Any) -> int | None:
     try:
         key = frame.attributes.values[0].contents.value[0]
         _call(key, frame.arguments.arrays(), frame.results.arrays())
-    except BaseException as error:  # nothing may leave through XLA, which is no Python
-        message = f"{type(error).__name__}: {error}".encode()
+    except BaseException:  # nothing may leave through XLA, which is no Python
+        message = traceback.format_exc().encode(errors="replace")
         given = _Error(ctypes.sizeof(_Error), None, message, _INTERNAL)
         return frame.api.contents.create_error(ctypes.byref(given))
     return None

@@ -133,7 +133,7 @@ class NativeEngine:
         state = (shape(model.nq), shape(model.nv), shape(model.nv))
         bodies = tuple(shape(*dims) for dims in body_dims(keys))
         seen = (shape(),) * self.host.seen
-        computes = _description(self.host, robot, substeps, num_envs)
+        computes = _description(self.host, robot, substeps, num_envs, threads, shards)
         self._step = HostFunction(self._on_batch("step"), (*state, *bodies, shape(keys, 3), *seen), b"step" + computes)
         self._forward = HostFunction(self._on_batch("forward"), bodies, b"forward" + computes)
 
@@ -172,10 +172,10 @@ class NativeEngine:
         return call
 
 
-def _description(host: type[HostBatch], robot: Robot, substeps: int, num_envs: int) -> bytes:
-    """All that a batch's results depend on besides its arguments."""
+def _description(host: type[HostBatch], robot: Robot, *numbers: int) -> bytes:
+    """All that a batch's results and its speed depend on besides its arguments."""
     model = np.empty(mujoco.mj_sizeModel(robot.model), np.uint8)
     mujoco.mj_saveModel(robot.model, None, model)
     places = (robot.key_body_ids.tolist(), robot.anchor_body_id, robot.foot_geom_ids.tolist())
     more = (robot.key_bodies, robot.head_geom_ids.tolist(), robot.pairs)
-    return repr((host.__qualname__, substeps, num_envs, *places, *more)).encode() + model.tobytes()
+    return repr((host.__qualname__, *numbers, *places, *more)).encode() + model.tobytes()

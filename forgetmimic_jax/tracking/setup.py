@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,6 +26,8 @@ from forgetmimic_jax.robot.model import Robot, load_robot
 from forgetmimic_jax.settings.config import Config, validate
 from forgetmimic_jax.tracking.layouts import find_layout
 from forgetmimic_jax.tracking.stand import STAND, stand_library
+
+MONTH = 30 * 24 * 3600.0  # s
 
 
 @dataclass(frozen=True)
@@ -48,13 +52,23 @@ def make_setup(config: Config) -> Setup:
     validate(config)
     find_layout(config.observation.layout)
     if not jax.config.values["jax_compilation_cache_dir"]:
-        jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "jax" / compiled_for()))
+        jax.config.update("jax_compilation_cache_dir", str(cache_of_programs()))
     robot = load_robot(config.robot, config.physics, config.action)
     folder = library_folder(config)
     library = load_library(robot, folder, fps=1.0 / config.physics.control_step)
     check_targets(config.unlearn.targets, library.names)
     instead = instead_of_targets(config, robot, library)
     return Setup(config, robot, library, library_hash(folder), instead=instead)
+
+
+def cache_of_programs() -> Path:
+    """The folder in which XLA keeps what it compiled here; programs of last month, and damaged ones with them, go."""
+    folder = cache_folder() / "jax" / compiled_for()
+    for program in folder.glob("*-cache"):
+        with contextlib.suppress(OSError):  # another process may be faster
+            if time.time() - program.stat().st_mtime > MONTH:
+                program.unlink()
+    return folder
 
 
 def library_folder(config: Config) -> Path:

@@ -115,7 +115,7 @@ def distil(
         due = alone and done % config.check_every == 0 and done < config.rounds
         if due and is_enough(config, score(assets, teaching, state.student), teachers):
             break
-    return state
+    return jax.block_until_ready(state)  # the environment may end with the caller; the last round must not run on
 
 
 def is_enough(config: DistilConfig, student: Score, teachers: Score) -> bool:

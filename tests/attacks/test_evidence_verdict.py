@@ -81,6 +81,14 @@ def test_a_recovery_names_the_attack_and_by_how_much(changes, reason):
     assert reason in verdict.reasons[0]
 
 
+def test_a_control_that_lost_the_kept_clips_excuses_nothing():
+    poor = {"originals__kept": {"walk": compared(0.95, 0.5)}}
+    known = {"originals__targets__punch": compared(0.9, 0.85), **poor}
+    assert judge(evidence(**known)).reasons[0].startswith("Still known: the target punch, skill 90 % [88, 92].")
+    lost = {"near_duplicates__kept__speed": compared(0.0, 0.05), **poor}
+    assert judge(evidence(**lost)).reasons == ("Lost: near-duplicates of the kept clips: speed, skill 0 % [-2, 2].",)
+
+
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [

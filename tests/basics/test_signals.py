@@ -13,6 +13,7 @@ STUCK = """
 import jax, jax.numpy as jnp, time
 from forgetmimic_jax.basics.errors import run_command
 from forgetmimic_jax.basics.signals import stop_requests
+from forgetmimic_jax.physics.host_call import HostFunction
 
 def never(x):
     print("computing", flush=True)
@@ -21,7 +22,8 @@ def never(x):
 def command():
     with stop_requests():
         x = jnp.zeros(3)
-        jax.block_until_ready(jax.jit(lambda x: jax.pure_callback(never, x, x))(x))
+        wait = HostFunction(never, (jax.ShapeDtypeStruct((3,), jnp.float32),), b"never")
+        jax.block_until_ready(jax.jit(wait)(x))
 
 run_command(command)
 """

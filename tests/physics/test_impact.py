@@ -132,7 +132,8 @@ def test_without_a_contact_it_is_the_training_s_engine(robot):
         single(qpos[:, 7:] + 0.1),
         jnp.zeros((2, 6)),
     )
-    states = [jax.jit(make(robot, SUBSTEPS, 2).step)(*arguments)[0] for make in (NativeEngine, ImpactEngine)]
+    engines = [make(robot, SUBSTEPS, 2) for make in (NativeEngine, ImpactEngine)]
+    states = [jax.jit(engine.step)(*arguments)[0] for engine in engines]
     for one, other in zip(*map(jax.tree.leaves, states), strict=True):
         np.testing.assert_array_equal(one, other)
 
