@@ -1,8 +1,10 @@
 """Functions of the host in compiled programs: what they are given and return, their errors, and XLA's cache."""
 
 import gc
+import os
 import subprocess
 import sys
+import time
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +12,7 @@ import numpy as np
 import pytest
 
 from forgetmimic_jax.physics.host_call import HostFunction
+from forgetmimic_jax.tracking.setup import cache_of_programs
 
 
 def floats(*shape: int) -> jax.ShapeDtypeStruct:
@@ -87,6 +90,19 @@ def test_of_two_functions_of_one_description_the_one_that_is_left_is_called():
     gc.collect()
     with pytest.raises((jax.errors.JaxRuntimeError, ValueError), match="calls a function that no longer exists"):
         compiled(jnp.float32(1.0))
+
+
+def test_programs_that_are_a_month_old_leave_the_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    folder = cache_of_programs()
+    assert folder.parent == tmp_path / "forgetmimic-jax" / "jax"
+    folder.mkdir(parents=True)
+    for days in (29, 31):
+        path = folder / f"jit_{days}-cache"
+        path.write_bytes(b"")
+        os.utime(path, times=(time.time() - days * 24 * 3600,) * 2)
+    assert cache_of_programs() == folder
+    assert [path.name for path in folder.iterdir()] == ["jit_29-cache"]
 
 
 PROGRAM = """
