@@ -29,7 +29,7 @@
 ## ARGS         flags as they are, and what comes before them; ARGS=--help lists all flags
 ## PYTHON       the Python that .venv is made from, 3.11 to 3.14 (default: the first found)
 PROGRAM = .venv/bin/python -m forgetmimic_jax
-SWITCHES = RESUME NOISE WRENCH DRAW DRY FORCE MIX_COMMITS NO_STOP FULL FAKES
+SWITCHES = RESUME NOISE WRENCH DRAW DRY FORCE MIX_COMMITS NO_STOP FULL FAKES KEEP_HEIGHT FILL_MISSING
 
 # The variables of the command line as flags; a switch has no value.
 given = $(foreach name,$(.VARIABLES),$(if $(filter command,$(origin $(name))),$(name)))

@@ -13,8 +13,7 @@ from forgetmimic_jax.studies.variants import variant_bars, variant_table
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Of a trial: enough to tell variants apart. `make unlearn` trains longer on a laptop; the studies of one variant at
-# that length say so.
+# Of a trial without a stop rule: enough to tell variants apart. Studies that train for longer say so.
 ITERATIONS = {"cpu": 200, "paper": 1000}
 
 Document = Mapping[str, Any]
