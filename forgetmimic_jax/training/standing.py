@@ -27,14 +27,16 @@ STANDING = Rule(runs_on=HOLD_SECONDS, replace_reference=True)
 # The teacher needs no clip any more, so it has no KL to the base.
 LEARNING: dict[str, Any] = {"minibatches": 4, "epochs": 4, "learning_rate": 3e-4, "base_kl": 0.0, "equal_clips": False}
 SECONDS = 2.0  # an episode: a robot that falls does so early, and short episodes have more starts
-# A robot falls from a few frames of a clip, such as the swing of a kick: narrow bins, and most starts by failure.
+# A robot falls from a few frames of a clip, such as the swing of a kick: narrow bins, which have few episodes each, and
+# most starts by failure. Who is asked for a clip is asked from its first frame on.
 STARTS: dict[str, Any] = {
     "rule": "adaptive",
     "clips": "all",
     "target_share": 1.0,
     "bin_seconds": 0.3,
     "uniform_ratio": 0.1,
-    "first_frame": 0.1,
+    "smoothing": 0.05,
+    "first_frame": 0.3,
 }
 
 
