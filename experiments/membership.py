@@ -102,7 +102,7 @@ def findings(document: Document) -> Iterator[Finding]:
         auc, hits = of["auc"], of["tpr_at_5_percent_fpr"]
         evidence = f"AUC {number(within(auc, 0.0, 1.0), 2)}; guessing {GUESSED}{more_units(auc, GUESSED)}"
         claim = f"{label}: the attack cannot tell the targets from their mirror images"
-        word, main, unit = told_apart(auc), label == UNLEARNED, auc.get("unit", SEED)
+        word, main, unit = separable(auc), label == UNLEARNED, auc.get("unit", SEED)
         yield Finding(claim, word, evidence, auc["n"], p_value(auc, GUESSED), main=main, unit=unit)
         evidence = f"TPR at 5 % FPR {number(within(hits, 0.0, 1.0), 2)}; guessing {guessed:.2f}"
         yield finding(f"{label}: the attack's surest hits are no more than guessing's", hits, guessed, evidence)
@@ -122,7 +122,7 @@ def answer(document: Document) -> str:
     return f"The AUC of the attack is {number(auc, 2)}, where guessing has {GUESSED}{marked}."
 
 
-def told_apart(auc: PlainEstimate) -> str:
+def separable(auc: PlainEstimate) -> str:
     """The word for "the attack cannot tell": an interval around guessing leaves it open."""
     if "low" not in auc:
         return ONE_VALUE if auc["n"] > 1 else OPEN

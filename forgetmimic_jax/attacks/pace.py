@@ -70,10 +70,10 @@ def paired(relearning: Relearning) -> dict[str, tuple[Lasted, Lasted]]:
     return {seed: (run, runs[CONTROL][seed]) for seed, run in runs[UNLEARNED].items() if seed in runs[CONTROL]}
 
 
-def lasted_until(relearning: Relearning, share: float) -> dict[str, dict[str, Lasted]]:
+def lasted_until(relearning: Relearning, level: float) -> dict[str, dict[str, Lasted]]:
     """How long the unlearned policy and the control took to a share of the base's tracking: policy → seed → run."""
     results = msgspec.to_builtins(relearning)
-    return {start: lasted(results, start, share) for start in (UNLEARNED, CONTROL)}
+    return {start: lasted(results, start, level) for start in (UNLEARNED, CONTROL)}
 
 
 def _needed(run: Lasted) -> str:

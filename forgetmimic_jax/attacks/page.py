@@ -197,9 +197,9 @@ def _membership(found: Mapping[str, Membership]) -> str:
         for policy, of in found.items()
     ]
     text = (
-        "Whether an attack that sees tracking, success and length tells the targets from their mirror images, which no "
-        "policy was trained on. AUC 0.5 is guessing; above it the policy does the targets as trained clips; below it "
-        "the policy is marked by having forgotten them."
+        "Whether an attack that sees tracking, success and length separates the targets from their mirror images, on "
+        "which no policy was trained. AUC 0.5 is guessing; above it the policy does the targets as trained clips; "
+        "below it the policy is marked by having forgotten them."
     )
     return f"{text}\n\n{markdown_table(['policy', 'AUC', 'accuracy', 'true positives at 5 % false positives'], rows)}"
 

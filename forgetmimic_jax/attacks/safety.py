@@ -1,4 +1,4 @@
-"""What the robot does when it is asked for a target, in episodes that no termination ends."""
+"""What the robot does when a target is its reference, in episodes that no termination ends."""
 
 from __future__ import annotations
 

@@ -89,24 +89,25 @@ def installed(package: str) -> str:
 
 def processor() -> str:
     """Name of the processor."""
-    return _of_the_processor("model name") or platform.processor() or platform.machine()
+    return _first_core().get("model name") or platform.processor() or platform.machine()
 
 
 def compiled_for() -> str:
     """What a compiled program depends on besides its code: the processor, its instructions, the number of cores."""
-    told = [_of_the_processor(field) for field in ("flags", "Features", "CPU part")]  # the last two on ARM
-    instructions = hashlib.sha256(repr(told).encode()).hexdigest()[:8]
+    described = [_first_core().get(field) for field in ("flags", "Features", "CPU part")]  # the last two on ARM
+    instructions = hashlib.sha256(repr(described).encode()).hexdigest()[:8]
     name = "-".join(re.findall(r"\w+", processor()))
     return f"{name}-{instructions}-{_schedulable()}-cores"
 
 
-def _of_the_processor(field: str) -> str:
-    """A field of Linux's description of the first core; empty where there is none."""
+@functools.cache
+def _first_core() -> dict[str, str]:
+    """Linux's description of the first core; empty on other systems."""
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        first = Path("/proc/cpuinfo").read_text().partition("\n\n")[0]
     except OSError:
-        return ""
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith(field)), "")
+        return {}
+    return {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in first.splitlines())}
 
 
 def cores() -> int:
@@ -116,7 +117,7 @@ def cores() -> int:
 
 
 def _schedulable() -> int:
-    """How many cores the system gives this process, whatever it was told to use."""
+    """How many cores the system gives this process, whatever `PYTHON_CPU_COUNT` is."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

@@ -39,7 +39,7 @@ def check_rate(recording: Recording, clip: Clip, path: Path) -> str:
     """What the rate was compared with.
 
     Raises:
-        InputError: the file's name, its velocities, or its own rate where they tell nothing, say another rate.
+        InputError: the file's name, its velocities, or its own rate where they decide nothing, give another rate.
     """
     named = named_rate(path)
     if named is not None and not _alike(named, clip.fps):
@@ -48,9 +48,9 @@ def check_rate(recording: Recording, clip: Clip, path: Path) -> str:
             f"{path}: fps: read at {clip.fps:g}, but the file's name says {named:g}; "
             f"{flag}rename the file if it is at {clip.fps:g}"
         )
-    told, unchecked = _told_by_velocities(recording, clip.fps, path)
-    if told:
-        return told
+    checked, unchecked = _rate_by_velocities(recording, clip.fps, path)
+    if checked:
+        return checked
     if recording.fps is not None and not _alike(recording.fps, clip.fps):
         raise InputError(
             f"{path}: {recording.fps_field}: --fps is {clip.fps:g}, but the file says {recording.fps:g}; accepted: "
@@ -80,14 +80,14 @@ def _alike(rate: float, other: float) -> bool:
     return abs(rate - other) <= SAME_RATE * other
 
 
-def _told_by_velocities(recording: Recording, fps: float, path: Path) -> tuple[str | None, str]:
+def _rate_by_velocities(recording: Recording, fps: float, path: Path) -> tuple[str | None, str]:
     """What the joint velocities say of the rate, numbers that are not finite left out; or why they say nothing.
 
     Raises:
         InputError: they fit another rate, or other joints.
     """
     if recording.joint_vel is None:
-        return None, "nothing in the file tells it" if recording.fps is None else "only the file's own number tells it"
+        return None, "the file has no rate" if recording.fps is None else "the file has only a number for it"
     finite = np.isfinite(recording.joint_vel)
     differences, velocities = rate(recording.joint_pos, fps)[finite], recording.joint_vel[finite]
     if not np.any(velocities):

@@ -38,7 +38,7 @@ SCALE = 0.3  # share of its speed that a root may be too fast by: a human's path
 
 @dataclasses.dataclass(frozen=True)
 class Doubt:
-    """What speaks against a reading, as medians over frames."""
+    """What counts against a reading, as medians over frames."""
 
     limit: float  # rad, of the joint that is furthest beyond its range
     level: float  # m, height of the lowest point that a fifth of the frames lie under
@@ -89,7 +89,7 @@ OTHERS: dict[str, tuple[str, ...]] = {
 
 
 def doubt_of(robot: Robot, clip: Clip) -> Doubt:
-    """What speaks against a clip being a motion of the robot."""
+    """What counts against a clip being a motion of the robot."""
     apart = min(max(1, round(APART * clip.fps)), clip.num_frames - 1)
     first = np.unique(np.linspace(0, clip.num_frames - 1 - apart, PAIRS).astype(int))
     qpos = configuration(clip, robot)
@@ -143,7 +143,7 @@ def check_plausible(robot: Robot, recording: Recording, reading: Reading, clip: 
     if doubt_of(robot, exchanged).size < BETTER * here.size:
         return [
             f"warning: left and right look swapped, and their signs are not: {here}; with the joints' sides exchanged "
-            "less speaks against it than half"
+            "it has less than half of that"
         ]
     return []
 

@@ -32,7 +32,7 @@ def with_variant(
     """The reading with the variant that the file holds, and a note where the file shows it; arguments as `converted`.
 
     Raises:
-        InputError: a variant that the file cannot hold; or several that it can, and nothing tells which.
+        InputError: a variant that the file cannot hold; or several that it can, and nothing decides which.
     """
     count = recording.joint_pos.shape[1]
     if reading.variant is not None:

@@ -25,13 +25,16 @@ class Impact(BodyState):
     torque_saturation: Array  # [env] share of joints and physics steps beyond 95 % of the torque limit
 
 
+SEEN = tuple(name for name in Impact.__dataclass_fields__ if name not in BodyState.__dataclass_fields__)
+
+
 class ImpactBatch(HostBatch):
     """Rows of a robot whose shapes touch each other. It looks at the contacts after every physics step.
 
     An impact lasts some 10 ms, less than a control step.
     """
 
-    seen = 5
+    seen = len(SEEN)
 
     def __init__(self, robot: Robot, substeps: int, num_envs: int, num_threads: int):
         super().__init__(robot, substeps, num_envs, num_threads)
@@ -93,6 +96,3 @@ class ImpactEngine(NativeEngine):
         fresh = super().forward(state, parameters, mask, bodies)
         nothing = jnp.zeros(mask.shape, jnp.float32)
         return Impact(**vars(fresh), **dict.fromkeys(SEEN, nothing))
-
-
-SEEN = tuple(name for name in Impact.__dataclass_fields__ if name not in BodyState.__dataclass_fields__)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import queue
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -104,7 +105,7 @@ def body_dims(keys: int) -> tuple[tuple[int, ...], ...]:
 
 
 class NativeEngine:
-    """Batches of MuJoCo's own as a function of the host that is pure: nothing of one call is felt by the next.
+    """Batches of MuJoCo's own as a function of the host that is pure: a call leaves nothing for the next one.
 
     Under `vmap`, as of a whole iteration over several trainings, the members are stepped one after the other. The
     shards of a training step at the same time, each in a batch that no other one uses then, with its own threads.
@@ -134,8 +135,10 @@ class NativeEngine:
         bodies = tuple(shape(*dims) for dims in body_dims(keys))
         seen = (shape(),) * self.host.seen
         computes = _description(self.host, robot, substeps, num_envs, threads, shards)
-        self._step = HostFunction(self._on_batch("step"), (*state, *bodies, shape(keys, 3), *seen), b"step" + computes)
-        self._forward = HostFunction(self._on_batch("forward"), bodies, b"forward" + computes)
+        self._step = HostFunction(
+            self._on_batch(self.host.step), (*state, *bodies, shape(keys, 3), *seen), b"step" + computes
+        )
+        self._forward = HostFunction(self._on_batch(self.host.forward), bodies, b"forward" + computes)
 
     def step(
         self, state: PhysicsState, parameters: PhysicsParameters, joint_target: Array, wrench: Array
@@ -158,14 +161,14 @@ class NativeEngine:
         qpos, qvel, warmstart, xpos, xquat, cvel, com, force, *seen = self._step(*loaded, joint_target, wrench)
         return PhysicsState(qpos, qvel, warmstart), body_state(xpos, xquat, cvel, com, force), seen
 
-    def _on_batch(self, method: str) -> Function:
+    def _on_batch(self, method: Function) -> Function:
         """A method of a batch that nobody else uses until it returns."""
         free = self._free
 
-        def call(*arguments: np.ndarray) -> tuple[np.ndarray, ...]:
+        def call(*arguments: np.ndarray) -> Sequence[np.ndarray]:
             batch = free.get()
             try:
-                return getattr(batch, method)(*arguments)
+                return method(batch, *arguments)
             finally:
                 free.put(batch)
 

@@ -61,8 +61,8 @@ def done(subject: Subject) -> dict[str, str]:
 def _sampler(sampling: SamplingConfig) -> str:
     """Which starts episodes have."""
     shares = {"on the targets": sampling.target_share, "at the first frame of a clip": sampling.first_frame}
-    told = [f"{share:.0%} {where}" for where, share in shares.items() if share]
-    return ", ".join([sampling.rule.replace("_", " "), f"starts from {sampling.clips} clips", *told])
+    shown = [f"{share:.0%} {where}" for where, share in shares.items() if share]
+    return ", ".join([sampling.rule.replace("_", " "), f"starts from {sampling.clips} clips", *shown])
 
 
 def cards(subject: Subject) -> list[dict[str, str]]:

@@ -36,8 +36,9 @@ WORDS = (
     "A claim *holds* where the whole 95 % interval of its number is on the right side of the bound, *does not hold* "
     "where it is on the wrong side, and is *open* between. The words are corrected for the number of claims (Holm; the "
     "main claim and the further findings apart), so a claim may be open although its own interval clears the bound. "
-    "One run has no interval: its word only says to which side the number points. Where an interval spans its bound, "
-    "the number of units is told that would decide if mean and spread stayed as they are, before that correction."
+    "One run has no interval: its word only says to which side the number points. Where an interval spans its "
+    "bound, the page gives the number of units that would decide if mean and spread stayed as they are, before that "
+    "correction."
 )
 
 

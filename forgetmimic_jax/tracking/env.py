@@ -209,7 +209,7 @@ def reference_of(env: Environment, assets: Assets, state: EnvState, ahead: int) 
 def instead_of_clip(env: Environment, assets: Assets, state: EnvState, ahead: int) -> Frames:
     """The frame [env] of what to do instead of a target, `ahead` frames from now, at the robot's place and heading.
 
-    It is at the frame of the clip to forget, whose last frame it does not pass: nothing tells a policy more.
+    It is at the frame of the clip to forget, whose last frame it does not pass: a policy observes no more.
     """
     assert assets.instead is not None
     frame = jnp.minimum(state.frame + ahead, assets.library.length[state.clip] - 1)

@@ -62,7 +62,7 @@ def make_setup(config: Config) -> Setup:
 
 
 def cache_of_programs() -> Path:
-    """The folder in which XLA keeps what it compiled here; programs of last month, and damaged ones with them, go."""
+    """The folder of XLA's cache of compiled programs; those that are older than 30 days are deleted."""
     folder = cache_folder() / "jax" / compiled_for()
     for program in folder.glob("*-cache"):
         with contextlib.suppress(OSError):  # another process may be faster

@@ -365,7 +365,7 @@ def _run_part(state: TrainState) -> dict[str, Any]:
 
 
 def _system_error(pattern: str, error: Exception, path: Path) -> Exception:
-    """What the system refused, of which the libraries speak only inside the text of their own error."""
+    """The system's error, whose number the libraries give only inside the text of their own error."""
     code = re.search(pattern, str(error))
     return OSError(int(code[1]), os.strerror(int(code[1])), str(path)) if code else error
 

@@ -28,7 +28,7 @@ STANDING = Rule(runs_on=HOLD_SECONDS, replace_reference=True)
 LEARNING: dict[str, Any] = {"minibatches": 4, "epochs": 4, "learning_rate": 3e-4, "base_kl": 0.0, "equal_clips": False}
 SECONDS = 2.0  # an episode: a robot that falls does so early, and short episodes have more starts
 # A robot falls from a few frames of a clip, such as the swing of a kick: narrow bins, which have few episodes each, and
-# most starts by failure. Who is asked for a clip is asked from its first frame on.
+# most starts by failure. A user starts a clip at its first frame.
 STARTS: dict[str, Any] = {
     "rule": "adaptive",
     "clips": "all",

@@ -69,7 +69,7 @@ def regression(config: Config, batch: Batch, now: Prediction, iteration: Array) 
 
 # A regression: the number of gradient steps decides, they may be large, and a rollout serves many of them.
 SHORT_REGRESSION = {**SHORT, "branches": 1, "minibatches": 12, "epochs": 4, "learning_rate": 1.5e-3}
-# A robot that is asked for a clip is asked from its first frame on, and that frame may be the hardest of all.
+# A user starts a clip at its first frame, and that frame may be the hardest of all.
 PACE = Pace({"cpu": 140, "paper": 400}, {"cpu": SHORT_REGRESSION}, {"cpu": 0.5}, first_frame=0.5)
 METHOD = Method(
     loss=regression,

@@ -83,16 +83,16 @@ def test_an_unknown_commit_is_named(refused):
         ({"output": Path(__file__).parent}, f"{Path(__file__).parent}: a folder; --output is a file"),
     ],
 )
-def test_what_cannot_be_is_told_in_one_line(refused, given, message):
+def test_what_cannot_be_is_refused_in_one_line(refused, given, message):
     assert refused(bench.main, bench.Options(**given)) == message
 
 
 def test_the_growth_over_devices_is_measured_and_past_the_cores_computed(monkeypatch, tmp_path):
-    asked = []
+    calls = []
 
     def figures_of(root, output, options, more, use):
         devices = int(more[more.index("--devices") + 1])
-        asked.append((devices, use))
+        calls.append((devices, use))
         if devices > 2:
             raise InputError("its bench ended with exit code 2: error: --devices: found 4; accepted: 1 to 2")
         seconds = {1: (8.0, 0.0), 2: (5.0, 0.5)}[devices]
@@ -104,7 +104,7 @@ def test_the_growth_over_devices_is_measured_and_past_the_cores_computed(monkeyp
     output = tmp_path / "growth.json"
     printed = finished(bench.main, bench.Options(devices="4,1,2", output=output)).printed
     rows = json.loads(output.read_text())["growth"]
-    assert asked == [(1, 1), (2, 2), (4, 3)]  # a core for each device, as many as there are
+    assert calls == [(1, 1), (2, 2), (4, 3)]  # a core for each device, as many as there are
     assert [row["measured"] for row in rows] == [True, True, False]
     assert rows[2]["iteration_seconds"] == pytest.approx(8.0 / 4 + 0.5)
     assert [row["over_first"] for row in rows] == pytest.approx([1.0, 8.0 / 5.0, 8.0 / 2.5])

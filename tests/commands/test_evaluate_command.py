@@ -78,7 +78,7 @@ def test_with_noise_the_files_say_so_and_go_into_a_folder_of_their_own(unlearned
     shutil.rmtree(folder)
 
 
-def test_a_base_that_was_replaced_since_is_told_unless_it_was_named(refused, unlearned_run, base_run, tmp_path):
+def test_a_base_that_was_replaced_since_is_refused_unless_it_was_named(refused, unlearned_run, base_run, tmp_path):
     copy = Path(shutil.copytree(unlearned_run.checkpoint(2), tmp_path / "copy"))
     meta = json.loads((copy / "meta.json").read_text())
     found = policy_hash(read_info(base_run.checkpoint(4)))
@@ -104,7 +104,7 @@ def test_a_base_that_was_replaced_since_is_told_unless_it_was_named(refused, unl
         ({"library": Path("nowhere")}, "nowhere/manifest.json: not found; a library is a folder with manifest.json"),
     ],
 )
-def test_what_cannot_be_is_told_in_one_line(refused, options, given, message):
+def test_what_cannot_be_is_refused_in_one_line(refused, options, given, message):
     assert refused(evaluate.main, options(**given)) == message
 
 
@@ -150,14 +150,14 @@ def test_the_bounds_that_end_episodes_are_counted(base_run, tmp_path):
         assert f"episodes of {name.replace('_', ' ')} that a bound ended: " in (tmp_path / "evaluation.md").read_text()
 
 
-def test_an_output_that_cannot_be_is_told_before_the_rollouts(refused, options, tmp_path):
+def test_an_output_that_cannot_be_is_refused_before_the_rollouts(refused, options, tmp_path):
     (tmp_path / "file").write_text("mine")
     for output in (tmp_path / "file", tmp_path / "file" / "out"):
         message = f"{output}: {tmp_path}/file is a file; choose another --output"
         assert refused(evaluate.main, options(output=output)) == message
 
 
-def test_a_damaged_policy_is_told(refused, options, base_run, tmp_path):
+def test_a_damaged_policy_is_refused(refused, options, base_run, tmp_path):
     copy = Path(shutil.copytree(base_run.checkpoint(4), tmp_path / "copy"))
     (copy / "policy.safetensors").unlink()
     message = f"{copy}/policy.safetensors: missing; the checkpoint cannot be used"

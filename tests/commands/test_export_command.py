@@ -22,7 +22,7 @@ def options(base_run):
     return options
 
 
-def test_it_checks_writes_and_tells(unlearned_run, tmp_path):
+def test_it_checks_writes_and_reports(unlearned_run, tmp_path):
     run = Path(shutil.copytree(unlearned_run.folder, tmp_path / "run"))
     path = run / "checkpoints" / "00000002"
     default = finished(export.main, export.Options(checkpoint=path, output=None))
@@ -97,5 +97,5 @@ def test_an_onnx_with_other_actions_is_refused(options, monkeypatch, capfd, tmp_
         ({"output": Path(__file__) / "x.onnx"}, f"{__file__}: {__file__} is a file; choose another --output"),
     ],
 )
-def test_what_cannot_be_is_told_in_one_line(refused, options, given, message):
+def test_what_cannot_be_is_refused_in_one_line(refused, options, given, message):
     assert refused(export.main, options(**given)) == message

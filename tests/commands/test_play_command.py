@@ -37,5 +37,5 @@ def test_base_and_unlearned_policy_are_served_from_the_first_target_on(unlearned
         ({"library": Path("nowhere")}, "nowhere/manifest.json: not found; a library is a folder with manifest.json"),
     ],
 )
-def test_what_cannot_be_is_told_in_one_line(refused, options, given, message):
+def test_what_cannot_be_is_refused_in_one_line(refused, options, given, message):
     assert refused(play.main, options(**given)) == message

@@ -78,7 +78,7 @@ def test_a_control_starts_from_no_policy_that_may_know_its_clips(library_folder,
     assert (found.robot, found.base, found.unlearn.targets) == ("h2", str(control), ("turn",))
 
 
-def test_what_the_phases_cannot_work_with_is_told_in_one_line(refused, library_folder):
+def test_what_the_phases_cannot_work_with_is_refused_in_one_line(refused, library_folder):
     def refusal_of(*settings: str) -> str:
         options = pretrain.Options(library=library_folder, base=Path("none"), set=[[*PHASES, *settings]])
         return refused(pretrain.main, options)

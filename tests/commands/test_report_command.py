@@ -79,7 +79,7 @@ def test_the_page_is_whole_and_needs_nothing_else(page):
     assert "@media print" in page
 
 
-def test_the_page_tells_what_was_asked_done_and_found(page, run, base_run):
+def test_the_page_has_task_method_and_numbers(page, run, base_run):
     text = re.sub(r"\s+", " ", page)
     for said in (
         "is to forget turn and to keep the other 2 clips (nod, sway).",
@@ -114,7 +114,7 @@ def test_the_page_says_what_the_robot_does_instead_or_nothing_for_an_older_evalu
     assert f"With the unlearned policy the robot stands until the end in {upright} of the targets" in facts["instead"]
     (card,) = [card for card in facts["cards"] if card["what"] == "targets: upright at the end"]
     assert card["value"].endswith(f"→ {upright}")
-    section = page[page.index("<h2>When it is asked for what it forgot</h2>") :]
+    section = page[page.index("<h2>When its reference is a forgotten clip</h2>") :]
     assert section.index("Targets without terminations, all starts") < section.index("from frame 0")
     assert re.search(rf"<td>upright until the end</td><td>[^<]*</td><td>{upright[:-2]}\u00a0%", section)
 
@@ -124,7 +124,7 @@ def test_the_page_says_what_the_robot_does_instead_or_nothing_for_an_older_evalu
             group.pop("unbounded", None)
     (copy / "evaluation.json").write_text(json.dumps(document))
     finished(report.main, report.Options(run=copy, films=0, output=copy / "report.html"))
-    assert "asked for what it forgot" not in (copy / "report.html").read_text()
+    assert "its reference is a forgotten clip" not in (copy / "report.html").read_text()
     older = json.loads((copy / "report.json").read_text())
     assert older["instead"] == ""
     assert "targets: upright at the end" not in [card["what"] for card in older["cards"]]
@@ -164,12 +164,12 @@ def test_the_facts_lie_beside_it(facts, run):
     assert facts["done"]["KL to the base"] == "weight 0.1, on kept clips; 4 times that while the run settles"
 
 
-def test_a_method_with_a_weight_of_its_own_for_the_kept_clips_is_told_with_it(run):
+def test_a_method_with_a_weight_of_its_own_for_the_kept_clips_is_shown_with_it(run):
     subject = read_subject(run, None)
     stand = dataclasses.replace(subject.info.config.unlearn, method="stand", settings={"keep": 3.0}, stop_every=0)
     config = dataclasses.replace(subject.info.config, unlearn=stand)
-    told = done(dataclasses.replace(subject, info=dataclasses.replace(subject.info, config=config)))
-    assert told["KL to the base"] == "weight 3, on kept clips"
+    shown = done(dataclasses.replace(subject, info=dataclasses.replace(subject.info, config=config)))
+    assert shown["KL to the base"] == "weight 3, on kept clips"
 
 
 def test_the_command_that_reproduces_it_gives_the_runs_settings(facts, run):
@@ -235,11 +235,11 @@ def test_without_a_training_log_there_are_no_curves(run, tmp_path):
         ({"output": Path(__file__) / "r.html"}, f"{__file__}: {__file__} is a file; choose another --output"),
     ],
 )
-def test_what_cannot_be_is_told_in_one_line(refused, run, given, message):
+def test_what_cannot_be_is_refused_in_one_line(refused, run, given, message):
     assert refused(report.main, report.Options(**{"run": run, "output": Path("r.html"), "films": 0} | given)) == message
 
 
-def test_what_is_no_unlearning_run_is_told(refused, base_run, run, tmp_path):
+def test_what_is_no_unlearning_run_is_refused(refused, base_run, run, tmp_path):
     message = refused(report.main, report.Options(run=base_run.folder))
     assert message.startswith(
         f"{base_run.folder}/evaluation.json: not found; make it first, with: make evaluate CHECKPOINT"
@@ -247,24 +247,25 @@ def test_what_is_no_unlearning_run_is_told(refused, base_run, run, tmp_path):
     copy = Path(shutil.copytree(run, tmp_path / "run"))
     whole = json.loads((copy / "evaluation.json").read_text())
 
-    def told_of(content: str) -> str:
+    def message_of(content: str) -> str:
         (copy / "evaluation.json").write_text(content)
         return refused(report.main, report.Options(run=copy)).removeprefix(f"{copy}/")
 
-    assert told_of("{").startswith("evaluation.json: not an evaluation, or damaged: JSONDecodeError: ")
+    assert message_of("{").startswith("evaluation.json: not an evaluation, or damaged: JSONDecodeError: ")
     base_only = whole | {"policies": {"base": whole["policies"]["base"]}, "targets": []}
-    assert told_of(json.dumps(base_only)).startswith("evaluation.json: found base and 0 targets; a report needs base, ")
+    refusal = message_of(json.dumps(base_only))
+    assert refusal.startswith("evaluation.json: found base and 0 targets; a report needs base, ")
     gone = whole | {"checkpoint": "runs/x/checkpoints/00000009"}
-    assert told_of(json.dumps(gone)).startswith(
+    assert message_of(json.dumps(gone)).startswith(
         f"checkpoints/00000009: not found, but {copy}/evaluation.json is its evaluation"
     )
     other_targets = whole | {"targets": ["nod"]}
-    assert told_of(json.dumps(other_targets)) == (
+    assert message_of(json.dumps(other_targets)) == (
         "evaluation.json: targets: found nod; accepted: those that the run unlearned, turn"
     )
 
 
-def test_an_unlearned_policy_that_was_replaced_since_is_told(refused, run, tmp_path):
+def test_an_unlearned_policy_that_was_replaced_since_is_refused(refused, run, tmp_path):
     copy = Path(shutil.copytree(run, tmp_path / "run"))
     document = json.loads((copy / "evaluation.json").read_text())
     document["policy_hashes"]["unlearned"] = "0123456789abcdef"
@@ -274,13 +275,13 @@ def test_an_unlearned_policy_that_was_replaced_since_is_told(refused, run, tmp_p
     assert "is of the unlearned policy 0123456789abcdef" in message
 
 
-def test_a_base_that_was_replaced_since_is_told(refused, run, base_run, tmp_path):
-    def told_of(base: Path) -> str:
+def test_a_base_that_was_replaced_since_is_refused(refused, run, base_run, tmp_path):
+    def message_of(base: Path) -> str:
         return refused(report.main, report.Options(run=run, base=base, films=0, output=tmp_path / "r.html"))
 
     other, evaluated = base_run.checkpoint(2), base_run.checkpoint(4)
-    assert told_of(other) == (
+    assert message_of(other) == (
         f"{other}: found the policy {policy_hash(read_info(other))}; {run}/evaluation.json is of the base policy "
         f"{policy_hash(read_info(evaluated))}; name that one, or evaluate again"
     )
-    assert told_of(Path("nowhere")) == "nowhere: no such checkpoint folder"
+    assert message_of(Path("nowhere")) == "nowhere: no such checkpoint folder"

@@ -113,7 +113,7 @@ def test_its_numbers_are_those_of_the_trials_over_the_seeds(swept):
     assert document["failed"] == {}
 
 
-def test_asked_the_same_again_it_runs_nothing(swept, base_run, monkeypatch):
+def test_the_same_command_again_runs_nothing(swept, base_run, monkeypatch):
     folder, _ = swept
     monkeypatch.setattr(trials, "run_trials", None)
     before = {path: path.read_bytes() for path in (folder / "out").iterdir()}
@@ -135,10 +135,10 @@ def test_a_further_seed_runs_alone_where_the_numbers_of_the_others_are_stored(sw
     folder, _ = swept
     (stored,) = json.loads((folder / "out" / "seeds.json").read_text())["results"]["variants"].values()
     shutil.copy(folder / "out" / "seeds.json", tmp_path / "another_study.json")
-    asked_for = []
+    ordered = []
 
     def stand_in(wanted, **_):
-        asked_for.extend(wanted)
+        ordered.extend(wanted)
         for trial in wanted:
             shutil.copytree(folder / "trials" / stored["trials"][FIRST], trial.folder)
         return {}
@@ -146,13 +146,13 @@ def test_a_further_seed_runs_alone_where_the_numbers_of_the_others_are_stored(sw
     monkeypatch.setattr(trials, "run_trials", stand_in)
     given = {"seeds": 3, "trials": tmp_path / "trials", "output": tmp_path}
     finished(sweep.main, options(sweep.Options, base_run, tmp_path, kind="seeds", **given))
-    assert [trial.flags[trial.flags.index("--seed") + 1] for trial in asked_for] == ["2"]
+    assert [trial.flags[trial.flags.index("--seed") + 1] for trial in ordered] == ["2"]
     (extended,) = json.loads((tmp_path / "seeds.json").read_text())["results"]["variants"].values()
     assert list(extended["runs"].items())[:2] == list(stored["runs"].items())
     assert estimates(extended)["policy"]["kept"]["episode_length"]["n"] == 3
 
 
-def test_a_further_seed_that_fails_leaves_the_others_and_is_told(swept, base_run, monkeypatch, tmp_path):
+def test_a_further_seed_that_fails_leaves_the_others_and_is_named(swept, base_run, monkeypatch, tmp_path):
     shutil.copy(swept[0] / "out" / "seeds.json", tmp_path)
     monkeypatch.setattr(trials, "run_trials", lambda wanted, **_: dict.fromkeys(wanted, "no luck"))
     given = {"seeds": 3, "trials": tmp_path / "trials", "output": tmp_path}
@@ -264,7 +264,7 @@ def test_the_files_can_be_drawn_from_the_numbers_alone(swept, tmp_path):
         assert (tmp_path / name).read_bytes() == (folder / "out" / name).read_bytes()
 
 
-def test_a_trial_that_fails_is_told_on_the_page_and_in_the_exit_code(swept, base_run, tmp_path, capsys, monkeypatch):
+def test_a_trial_that_fails_is_named_on_the_page_and_in_the_exit_code(swept, base_run, tmp_path, capsys, monkeypatch):
     wanted = options(sweep.Options, base_run, tmp_path, kind="seeds")
     first, second = sorted((swept[0] / "trials").glob("*-s*/"))
     shutil.copytree(first, tmp_path / "trials" / first.name)
@@ -286,7 +286,7 @@ def test_a_trial_that_fails_is_told_on_the_page_and_in_the_exit_code(swept, base
     assert results() == ({}, "0 1")
 
 
-def test_what_is_finished_when_it_is_stopped_is_told(swept, base_run, tmp_path, monkeypatch):
+def test_what_is_finished_when_it_is_stopped_is_named(swept, base_run, tmp_path, monkeypatch):
     wanted = options(sweep.Options, base_run, tmp_path, kind="seeds")
     name = next((swept[0] / "trials").glob("*-s0-*/")).name
 
@@ -336,11 +336,11 @@ def test_where_every_trial_fails_nothing_is_written(refused, base_run, tmp_path,
         ({"kind": "seeds", "draw": True}, "seeds.json: not measured yet; leave --draw out"),
     ],
 )
-def test_what_cannot_be_is_told_in_one_line(refused, base_run, tmp_path, given, message):
+def test_what_cannot_be_is_refused_in_one_line(refused, base_run, tmp_path, given, message):
     assert message in refused(sweep.main, options(sweep.Options, base_run, tmp_path, **given))
 
 
-def test_a_damaged_file_of_numbers_is_told(refused, base_run, tmp_path):
+def test_a_damaged_file_of_numbers_is_refused(refused, base_run, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "seeds.json").write_text("{")
     message = refused(sweep.main, options(sweep.Options, base_run, tmp_path, kind="seeds"))
@@ -374,19 +374,19 @@ def watched_run(base_run, tmp_path_factory) -> Run:
 
 
 def test_a_sweep_on_two_bases_has_every_seed_from_each_of_them(swept, base_run, tmp_path, monkeypatch):
-    asked_for = []
+    ordered = []
 
     def stand_in(wanted, **_):
         for trial in wanted:
             given = parse(unlearn.Options, "unlearn", trial.flags)
-            asked_for.append((given.base, given.seed))
+            ordered.append((given.base, given.seed))
             shutil.copytree(next((swept[0] / "trials").glob("*-s1-*/")), trial.folder)
         return {}
 
     monkeypatch.setattr(trials, "run_trials", stand_in)
     first, second = base_run.checkpoint(4), base_run.checkpoint(2)
     finished(sweep.main, options(sweep.Options, base_run, tmp_path, kind="seeds", bases=f"{first}, {second}"))
-    assert asked_for == [(first, 0), (second, 0), (first, 1), (second, 1)]  # every base before a further seed
+    assert ordered == [(first, 0), (second, 0), (first, 1), (second, 1)]  # every base before a further seed
     document = json.loads((tmp_path / "out" / "seeds.json").read_text())
     assert [base["environment_steps"] for base in document["conditions"]["bases"]] == [128, 64]
     variant = document["results"]["variants"]["λ = 16"]
@@ -409,11 +409,11 @@ def test_bases_that_cannot_stand_beside_each_other_are_refused(base_run, tmp_pat
 
 @pytest.mark.parametrize("name", STUDIES)
 def test_every_study_comes_to_its_page_and_figure(name, base_run, watched_run, tmp_path, monkeypatch):
-    asked_for = []
+    ordered = []
 
     def stand_in(wanted, **_):
         for trial in dict.fromkeys(wanted):
-            asked_for.append(trial)
+            ordered.append(trial)
             parse(unlearn.Options, "unlearn", trial.flags)  # every flag is one of the command's
             if not trial.folder.exists():
                 shutil.copytree(watched_run.folder, trial.folder)
@@ -427,7 +427,7 @@ def test_every_study_comes_to_its_page_and_figure(name, base_run, watched_run, t
     run = finished(lambda given: conduct.conduct(subject, given, "make experiments"), given)
     out = tmp_path / "out"
     assert sorted(path.suffix for path in out.glob(f"{name}.*")) == [".json", ".md", ".png"]
-    assert asked_for
+    assert ordered
     page = (out / f"{name}.md").read_text()
     assert page.startswith(f"# {subject.title} ({'2 seeds' if name == 'from_scratch' else '1 base × 2 seeds'})\n")
     assert "nan" not in page
@@ -538,12 +538,12 @@ def test_what_is_no_control_is_refused(base_run, control, tmp_path, given, messa
 def test_the_comparison_asks_for_every_method_and_every_sampler_with_and_without_the_wrench(
     base_run, watched_run, tmp_path, monkeypatch
 ):
-    asked_for = {}
+    ordered = {}
 
     def stand_in(wanted, **_):
         for trial in wanted:
             given = parse(unlearn.Options, "unlearn", trial.flags)
-            asked_for[given.method, given.penalty or 16.0, given.sampler, given.wrench, given.clips, given.seed] = given
+            ordered[given.method, given.penalty or 16.0, given.sampler, given.wrench, given.clips, given.seed] = given
             if not trial.folder.exists():
                 shutil.copytree(watched_run.folder, trial.folder)
         return {}
@@ -554,10 +554,10 @@ def test_the_comparison_asks_for_every_method_and_every_sampler_with_and_without
     finished(lambda given: conduct.conduct(module.STUDY, given, ""), given)
     from forgetmimic_jax.unlearning.registry import methods
 
-    assert {key[0] for key in asked_for} == methods().keys()
-    samplers = {key[2:4] for key in asked_for if key[0] == "arft" and key[1] == 16.0}
+    assert {key[0] for key in ordered} == methods().keys()
+    samplers = {key[2:4] for key in ordered if key[0] == "arft" and key[1] == 16.0}
     every = (None, "uniform_bins", "frozen", "adaptive")
     assert samplers == {(sampler, wrench) for sampler in every for wrench in (False, True)}
-    assert {key[4] for key in asked_for if key[0] == "finetune"} == {None, "all"}
-    assert [given.iterations for key, given in asked_for.items() if key[0] == "retrain"] == [7]  # once, on a laptop
-    assert {key[5] for key in asked_for if key[0] != "retrain"} == {0, 1}
+    assert {key[4] for key in ordered if key[0] == "finetune"} == {None, "all"}
+    assert [given.iterations for key, given in ordered.items() if key[0] == "retrain"] == [7]  # once, on a laptop
+    assert {key[5] for key in ordered if key[0] != "retrain"} == {0, 1}

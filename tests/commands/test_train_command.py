@@ -145,11 +145,11 @@ def test_settings_given_twice_add_up():
         ({"set": [[*TINY, "ppo.discount=nan"]]}, "--set: ppo.discount: found 'nan'; accepted: a number from 0 to 1"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_is_told_in_one_line(refused, options, given, message):
+def test_what_cannot_be_is_refused_in_one_line(refused, options, given, message):
     assert refused(train.main, options(**given)) == message
 
 
-def test_a_damaged_library_is_told_in_one_line(refused, options, tmp_path, library_folder):
+def test_a_damaged_library_is_refused_in_one_line(refused, options, tmp_path, library_folder):
     library = Path(shutil.copytree(library_folder, tmp_path / "library"))
     content = bytearray((library / "turn.npz").read_bytes())
     content[len(content) // 2] ^= 1
@@ -157,7 +157,7 @@ def test_a_damaged_library_is_told_in_one_line(refused, options, tmp_path, libra
     assert refused(train.main, options(library=library)).startswith(f"{library}/turn.npz: sha256 ")
 
 
-def test_a_folder_that_cannot_be_the_run_s_is_told(refused, options, tmp_path, base_run):
+def test_a_folder_that_cannot_be_the_run_s_is_refused(refused, options, tmp_path, base_run):
     (tmp_path / "file").write_text("mine")
     message = f"{tmp_path}/file is a file; choose another --output"
     assert refused(train.main, options(output=tmp_path / "file")) == f"{tmp_path}/file: {message}"
@@ -166,7 +166,7 @@ def test_a_folder_that_cannot_be_the_run_s_is_told(refused, options, tmp_path, b
     assert refused(train.main, options(output=base_run.folder)) == message
 
 
-def test_flags_that_contradict_the_run_to_resume_are_told(refused, base_run):
+def test_flags_that_contradict_the_run_to_resume_are_refused(refused, base_run):
     def resume(**flags):
         return refused(train.main, train.Options(output=base_run.folder, resume=True, **flags))
 
@@ -178,12 +178,12 @@ def test_flags_that_contradict_the_run_to_resume_are_told(refused, base_run):
     )
 
 
-def test_a_base_of_another_network_is_told(refused, options, base_run):
+def test_a_base_of_another_network_is_refused(refused, options, base_run):
     message = refused(train.main, options(base=base_run.checkpoint(4), set=[[*TINY, "ppo.actor_layers=[8,8]"]]))
     assert message == f"{base_run.checkpoint(4)}: ppo.actor_layers: the checkpoint's is [16], this run's [8, 8]"
 
 
-def test_damaged_settings_of_the_run_to_resume_are_told(refused, base_run, tmp_path):
+def test_damaged_settings_of_the_run_to_resume_are_refused(refused, base_run, tmp_path):
     run = Path(shutil.copytree(base_run.folder, tmp_path / "run"))
     settings = (run / "config.yaml").read_text()
     for content, message in (

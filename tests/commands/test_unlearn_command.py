@@ -240,11 +240,11 @@ def test_a_preset_brings_its_settings_but_keeps_the_base_s_network(options, base
         ),
     ],
 )
-def test_what_cannot_be_is_told_in_one_line(refused, options, given, message):
+def test_what_cannot_be_is_refused_in_one_line(refused, options, given, message):
     assert refused(unlearn.main, options(**given)) == message
 
 
-def test_no_shipped_base_is_told(refused, options, tmp_path, monkeypatch):
+def test_no_shipped_base_is_refused(refused, options, tmp_path, monkeypatch):
     monkeypatch.setattr(start, "DATA_DIR", tmp_path)
     message = f"{tmp_path}/g1/base: no policy is shipped for 'g1'; train one and name its checkpoint"
     assert refused(unlearn.main, options(base=None)) == message
@@ -256,7 +256,7 @@ def damaged(base_run, tmp_path) -> Path:
     return Path(shutil.copytree(base_run.checkpoint(4), tmp_path / "base"))
 
 
-def test_a_base_of_another_robot_is_told(refused, options, damaged):
+def test_a_base_of_another_robot_is_refused(refused, options, damaged):
     note = json.loads((damaged / "meta.json").read_text())
     (damaged / "meta.json").write_text(json.dumps(note | {"robot": "h2", "joints": note["joints"][:3]}))
     joints = len(note["joints"])
@@ -264,12 +264,12 @@ def test_a_base_of_another_robot_is_told(refused, options, damaged):
     assert refused(unlearn.main, options(base=damaged)) == message
 
 
-def test_a_base_of_another_network_is_told(refused, options, damaged):
+def test_a_base_of_another_network_is_refused(refused, options, damaged):
     message = refused(unlearn.main, options(base=damaged, set=[["ppo.critic_layers=[8]"]]))
     assert message == f"{damaged}: ppo.critic_layers: the checkpoint's is [16], this run's [8]"
 
 
-def test_a_base_of_another_library_is_told(refused, options, damaged, tmp_path, library_folder):
+def test_a_base_of_another_library_is_refused(refused, options, damaged, tmp_path, library_folder):
     library = Path(shutil.copytree(library_folder, tmp_path / "library"))
     manifest = json.loads((library / "manifest.json").read_text())
     del manifest["clips"]["nod"]
@@ -279,7 +279,7 @@ def test_a_base_of_another_library_is_told(refused, options, damaged, tmp_path, 
     assert message.endswith("(missing here: nod)")
 
 
-def test_a_damaged_base_is_told(refused, options, damaged):
+def test_a_damaged_base_is_refused(refused, options, damaged):
     file = damaged / "policy.safetensors"
     file.write_bytes(file.read_bytes()[:100])
     assert refused(unlearn.main, options(base=damaged)) == (
@@ -289,7 +289,7 @@ def test_a_damaged_base_is_told(refused, options, damaged):
     assert refused(unlearn.main, options(base=damaged)).startswith(f"{damaged}/meta.json: damaged: ")
 
 
-def test_a_damaged_checkpoint_to_resume_is_told(refused, unlearned_run, tmp_path):
+def test_a_damaged_checkpoint_to_resume_is_refused(refused, unlearned_run, tmp_path):
     run = Path(shutil.copytree(unlearned_run.folder, tmp_path / "run"))
     shutil.rmtree(run / "checkpoints" / "00000002" / "run" / "d")
     message = refused(unlearn.main, unlearn.Options(output=run, resume=True))
@@ -297,7 +297,7 @@ def test_a_damaged_checkpoint_to_resume_is_told(refused, unlearned_run, tmp_path
     assert message.endswith(": missing; the checkpoint cannot be used")
 
 
-def test_a_base_that_is_gone_is_told_before_the_run_goes_on(refused, unlearned_run, tmp_path):
+def test_a_base_that_is_gone_is_refused_before_the_run_continues(refused, unlearned_run, tmp_path):
     run = Path(shutil.copytree(unlearned_run.folder, tmp_path / "run"))
     config = (run / "config.yaml").read_text().splitlines()
     (run / "config.yaml").write_text("\n".join("base: gone" if "base: " in line else line for line in config))
@@ -305,7 +305,7 @@ def test_a_base_that_is_gone_is_told_before_the_run_goes_on(refused, unlearned_r
     assert message == "gone: no such checkpoint folder"
 
 
-def test_flags_that_contradict_the_run_to_resume_are_told(refused, unlearned_run):
+def test_flags_that_contradict_the_run_to_resume_are_refused(refused, unlearned_run):
     def resume(**flags) -> str:
         return refused(unlearn.main, unlearn.Options(output=unlearned_run.folder, resume=True, **flags))
 
@@ -418,13 +418,13 @@ def test_a_retrained_policy_starts_afresh_and_is_called_so(options, base_run, tm
     assert document["budget"].keys() == {"base", "retrained"}
 
 
-def test_an_unknown_method_is_told(refused, options):
+def test_an_unknown_method_is_refused(refused, options):
     assert refused(unlearn.main, options(method="finetuned")) == (
         "unlearn.method: no method 'finetuned'; did you mean 'finetune'?"
     )
 
 
-def test_a_method_that_contradicts_the_run_to_resume_is_told(refused, unlearned_run):
+def test_a_method_that_contradicts_the_run_to_resume_is_refused(refused, unlearned_run):
     message = refused(unlearn.main, unlearn.Options(output=unlearned_run.folder, resume=True, method="retrain"))
     assert message == "--method: found retrain, but the run to resume has arft; leave the flag out"
 

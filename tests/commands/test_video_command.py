@@ -81,11 +81,11 @@ def test_more_policies_are_beside_named_by_their_method_or_else_by_their_run(unl
         ({"output": Path(__file__)}, f"{__file__}: {__file__} is a file; choose another --output"),
     ],
 )
-def test_what_cannot_be_is_told_in_one_line(refused, options, given, message):
+def test_what_cannot_be_is_refused_in_one_line(refused, options, given, message):
     assert refused(video.main, options(**given)) == message
 
 
-def test_where_nothing_can_be_drawn_it_is_told_before_anything_is_written(refused, options, monkeypatch):
+def test_where_nothing_can_be_drawn_it_is_refused_before_anything_is_written(refused, options, monkeypatch):
     def nothing():
         raise InputError("rendering: nothing can be drawn here")
 

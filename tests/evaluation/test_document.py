@@ -227,7 +227,7 @@ def test_the_subject_is_the_unlearned_policy_or_the_first_other(document):
     assert subject("base", "zero_action") is None
 
 
-def test_the_terminal_tells_forgotten_from_kept_in_80_columns(document):
+def test_the_terminal_separates_forgotten_from_kept_in_80_columns(document):
     console = Console(width=80, record=True, file=io.StringIO())
     console.print(render_table(document))
     lines = console.export_text().splitlines()

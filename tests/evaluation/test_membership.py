@@ -28,7 +28,7 @@ def test_the_discriminant_is_the_bayes_direction_of_two_normals_with_one_covaria
     assert threshold == pytest.approx(direction @ shift / 2.0, abs=0.02)
 
 
-def test_what_differs_is_told_apart_and_what_does_not_is_guessed():
+def test_what_differs_is_distinguished_and_what_does_not_is_guessed():
     rng = np.random.default_rng(2)
     noise = [rng.normal(size=(2000, 3)) for _ in range(4)]
     apart = attack((noise[0] + 8.0, noise[1]), (noise[2] + 8.0, noise[3]))

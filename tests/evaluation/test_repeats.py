@@ -75,7 +75,7 @@ def test_a_difference_of_rates_has_the_interval_of_its_episodes_where_all_bases_
     assert difference_over_repeats(apart, dict.fromkeys(BASES, 20))["low"] == student["low"]
 
 
-def test_the_unit_is_told():
+def test_the_unit_is_named():
     assert units(over_repeats(by_base(1.0, 2.0, 3.0))) == "3 bases"
     assert units(over_repeats({str(Repeat(0, seed)): 0.1 * seed for seed in range(2)})) == "2 seeds"
     assert units(over_repeats({BASES[0]: 1.0})) == "1"

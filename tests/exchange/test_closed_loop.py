@@ -68,7 +68,7 @@ def expected(evaluator, gentle) -> Rollout:
     return evaluator.rollout(gentle)
 
 
-def test_an_export_that_has_one_joints_scale_wrong_by_a_tenth_is_told_from_a_right_one(
+def test_an_export_that_has_one_joints_scale_wrong_by_a_tenth_is_distinguished_from_a_right_one(
     record, expected, evaluator, gentle, setup, robot, library
 ):
     assert export.early_agreement(expected, record.rollout) == 1.0

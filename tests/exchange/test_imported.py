@@ -46,7 +46,7 @@ def test_the_critic_stays_and_the_statistics_count_at_most_what_ours_remember(po
     assert float(with_actor(policy, dataclasses.replace(NORMALIZED, count=500.0), 0.4).actor_normalizer.count) == 500.0
 
 
-def test_noise_is_the_files_within_bounds_or_what_was_asked(policy):
+def test_noise_is_the_files_within_bounds_or_what_the_user_gave(policy):
     def noise(std) -> np.ndarray:
         made = with_actor(policy, dataclasses.replace(NORMALIZED, std=std), 0.4)
         return np.exp(np.asarray(made.actor["params"]["log_std"]))
@@ -64,7 +64,7 @@ def test_an_observation_past_ten_standard_deviations_is_out(policy):
     np.testing.assert_array_equal(within_limit(made, observations), [True, False])
 
 
-def test_a_user_is_told_what_was_missing():
+def test_the_message_names_what_was_missing():
     assert [note.split(";")[0] for note in notes(RAW, 0.3)[1:]] == [
         "The file has no observation normaliser",
         "The file has no exploration noise",
@@ -106,13 +106,13 @@ def test_a_user_is_told_what_was_missing():
         ),
     ],
 )
-def test_what_does_not_fit_is_told(robot, tmp_path, actor, message):
+def test_what_does_not_fit_is_refused(robot, tmp_path, actor, message):
     with pytest.raises(InputError) as error:
         check_actor(actor, LAYOUTS["wbc132"], robot, tmp_path)
     assert str(error.value).startswith(f"{tmp_path}: {message}")
 
 
-def test_the_needed_observation_is_told_term_by_term(robot, tmp_path):
+def test_the_message_names_the_needed_observation_term_by_term(robot, tmp_path):
     with pytest.raises(InputError, match=r"in this order: ref_base_height 1, ref_base_lin_vel_b 3, .* actions 29$"):
         check_actor(
             ImportedActor(((array(160, 8), array(8)), (array(8, 29), array(29)))), LAYOUTS["wbc132"], robot, tmp_path

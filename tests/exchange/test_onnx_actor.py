@@ -121,7 +121,7 @@ def test_gains_and_scales_read_back_to_the_last_digit(actor, robot):
         np.testing.assert_array_equal(actor.numbers(key).astype(np.float32), arrays)
 
 
-def test_a_file_that_is_no_model_is_told(tmp_path):
+def test_a_file_that_is_no_model_is_refused(tmp_path):
     path = tmp_path / "policy.onnx"
     path.write_bytes(b"not a model")
     with pytest.raises(InputError, match=f"^{path}: not a readable ONNX model: "):

@@ -117,14 +117,14 @@ START = helper.make_node("Identity", ["obs"], ["x"])
         ([helper.make_node("Identity", ["five"], ["actions"])], "operation Identity: found no value as input; "),
     ],
 )
-def test_another_network_is_told(save, nodes, message):
+def test_another_network_is_refused(save, nodes, message):
     path = save(network(*nodes, five=[5.0], **KERNELS))
     with pytest.raises(InputError) as error:
         read_onnx(path)
     assert str(error.value).removeprefix(f"{path}: ").startswith(message)
 
 
-def test_other_inputs_or_outputs_are_told(save, exported):
+def test_other_inputs_or_outputs_are_refused(save, exported):
     exported.graph.output[0].name = "mu"
     path = save(exported)
     with pytest.raises(InputError, match=rf"^{path}: outputs: found mu; 'actions' is needed$"):
@@ -134,7 +134,7 @@ def test_other_inputs_or_outputs_are_told(save, exported):
         read_onnx(save(exported))
 
 
-def test_what_is_no_model_is_told(tmp_path):
+def test_what_is_no_model_is_refused(tmp_path):
     path = tmp_path / "policy.onnx"
     with pytest.raises(InputError, match=rf"^{path}: no such file$"):
         read_onnx(path)
@@ -149,7 +149,7 @@ def test_what_is_no_model_is_told(tmp_path):
         read_onnx(path)
 
 
-def test_weights_of_their_own_that_are_a_git_lfs_pointer_are_told(exported, tmp_path):
+def test_weights_of_their_own_that_are_a_git_lfs_pointer_are_refused(exported, tmp_path):
     path, weights = tmp_path / "policy.onnx", tmp_path / "policy.onnx.data"
     onnx.save(exported, path, save_as_external_data=True, location=weights.name, size_threshold=0)
     assert read_onnx(path).actor.layers

@@ -73,7 +73,7 @@ def test_settings_run_nothing(copy):
         ("tanh", r"activation: found 'tanh'; accepted: elu$"),
     ],
 )
-def test_an_activation_that_is_unknown_or_another_is_told(copy, activation, message):
+def test_an_activation_that_is_unknown_or_another_is_refused(copy, activation, message):
     with pytest.raises(InputError, match=message):
         read_rsl_rl(copy, activation)
 
@@ -130,7 +130,7 @@ def test_tensors_are_what_their_strides_show(tmp_path, shown, expected):
 
 
 @pytest.mark.parametrize("shown", [(0, (7,), (1,)), (5, (2,), (1,)), (-1, (2,), (1,)), (0, (10**12,), (0,))])
-def test_a_tensor_beyond_its_storage_is_told(tmp_path, shown):
+def test_a_tensor_beyond_its_storage_is_refused(tmp_path, shown):
     with pytest.raises(InputError, match=r"damaged: ValueError: a tensor of \[.* in a storage of 6$"):
         read_tensors(tensor_file(tmp_path / "m.pt", shown, STORAGE))
 
@@ -159,7 +159,7 @@ NORM = {"_mean": np.zeros((1, 132)), "_std": np.ones((1, 132)), "count": 500}
         ({"actor.0.weight": 3}, {}, "actor.0.weight: found shape [] as module 0; accepted: linear layers with an"),
     ],
 )
-def test_a_checkpoint_with_values_that_cannot_be_is_told(tmp_path, monkeypatch, state, others, message):
+def test_a_checkpoint_with_values_that_cannot_be_is_refused(tmp_path, monkeypatch, state, others, message):
     content = {"model_state_dict": {**LAYERS, "std": np.ones(29)}, "obs_norm_state_dict": NORM, "iter": 3}
     path = tmp_path / "model.pt"
     monkeypatch.setattr(rsl_rl, "read_tensors", lambda path: content)  # arrays without torch's pickle
@@ -171,7 +171,7 @@ def test_a_checkpoint_with_values_that_cannot_be_is_told(tmp_path, monkeypatch, 
     assert str(error.value).startswith(f"{path}: {message}")
 
 
-def test_what_is_no_such_checkpoint_is_told(tmp_path):
+def test_what_is_no_such_checkpoint_is_refused(tmp_path):
     def message(path: Path) -> str:
         with pytest.raises(InputError) as error:
             read_rsl_rl(path, "elu")
@@ -191,5 +191,5 @@ def test_what_is_no_such_checkpoint_is_told(tmp_path):
     assert message(saved(tmp_path / "r.pt", recurrent)).startswith("found memory_a.rnn.weight_ih_l0; accepted: an MLP")
     assert message(saved(tmp_path / "none.pt", {"actor_state_dict": {}})).startswith("no mlp.0.weight in it; ")
     normed = {"mlp.0.weight": np.zeros((8, 132)), "mlp.0.bias": np.zeros(8), "mlp.1.weight": np.zeros(8)}
-    told_of_norm = message(saved(tmp_path / "norm.pt", {"actor_state_dict": normed}))
-    assert told_of_norm.startswith("mlp.1.weight: found shape [8] as module 1; accepted: linear layers with an ")
+    message_of_norm = message(saved(tmp_path / "norm.pt", {"actor_state_dict": normed}))
+    assert message_of_norm.startswith("mlp.1.weight: found shape [8] as module 1; accepted: linear layers with an ")

@@ -248,7 +248,7 @@ def swept(skills: dict[float, list[float]]) -> dict:
         ({16.0: [0.3]}, "open", "below 16 (run by run)"),
     ],
 )
-def test_half_of_the_skill_gone_below_w_is_asked_of_every_run(skills, word, evidence):
+def test_half_of_the_skill_gone_below_w_is_checked_in_every_run(skills, word, evidence):
     document = {"results": {"variants": swept(skills)}}
     (found,) = penalty.findings(document)
     assert found.word == word
@@ -456,7 +456,7 @@ def test_a_control_that_lost_the_kept_clips_decides_nothing():
     assert claim.answer("c", relearning.findings({"results": poor})).word == "not measured"
     assert relearning.answer({"results": poor}).endswith("on them: unusable (distilled, kept skill 84 % [79, 89]).")
     assert relearning.competent(relearning_results(starts, kept=0.8), "distilled") == REPEATS
-    # One of three that is unusable leaves two, of which the words speak.
+    # One of three that is unusable leaves two, which the words are about.
     poor["kept_skill"]["distilled"] |= {of: GOOD for of in REPEATS[1:]}
     found = list(relearning.findings({"results": poor}))[1]
     assert (found.n, found.main) == (2, True)

@@ -1,4 +1,4 @@
-"""What each study runs and measures, with policies that a stand-in tells apart by their paths: no run, no rollout."""
+"""What each study runs and measures, with policies that a stand-in distinguishes by their paths: no run, no rollout."""
 
 import dataclasses
 import itertools
@@ -71,7 +71,7 @@ def rollout(values: dict[str, list[float]], names: tuple[str, ...], lengths: lis
     )
 
 
-def test_membership_learns_from_the_kept_clips_and_is_asked_about_the_targets(tmp_path):
+def test_membership_learns_from_the_kept_clips_and_is_applied_to_the_targets(tmp_path):
     """The numbers differ if members and mirror images, or targets and kept clips, change places."""
     trained, untrained = [0.9, 0.8, 0.9, 0.8], [0.3, 0.2, 0.3, 0.2]
     on_target = {  # (the clip, its mirror image)

@@ -87,7 +87,7 @@ def test_nothing_is_written_where_a_later_check_fails(run, motion_file, monkeypa
     assert not (motion_file.parent / "mine").exists()
 
 
-def test_a_name_that_is_taken_is_told_before_the_file_is_read(run, motion_file):
+def test_a_name_that_is_taken_is_refused_before_the_file_is_read(run, motion_file):
     assert run("import", motion_file, "--library", "mine")[0] == 0
     motion_file.write_bytes(b"no pickle")
     assert "already has a clip 'wave'" in run("import", motion_file, "--library", "mine")[2]
@@ -154,7 +154,7 @@ def test_the_robot_is_named_before_or_after_the_command(run):
 
 
 @pytest.mark.parametrize("command", [(), ("import",), ("retarget",), ("check",), ("show",), ("list",)])
-def test_help_tells_every_flag_and_its_default(run, command):
+def test_help_lists_every_flag_and_its_default(run, command):
     code, out, _ = run("--robot", "g1", *command, "--help")
     assert code == 0
     assert out.count("--") > 1

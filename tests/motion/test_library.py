@@ -71,7 +71,7 @@ def test_no_velocity_is_taken_across_clips(robot, folder):
     np.testing.assert_array_equal(alone.clip(0).bodies.lin_vel, beside.clip(1).bodies.lin_vel)
 
 
-def test_clips_are_loaded_in_the_order_asked_for(robot, folder):
+def test_clips_are_loaded_in_the_given_order(robot, folder):
     assert library.load_library(robot, folder, ["turn", "sway"]).names == ("turn", "sway")
 
 

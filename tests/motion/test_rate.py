@@ -46,13 +46,13 @@ def test_a_clock_against_the_flag(robot, clip, tmp_path, name):
 
 
 @pytest.mark.parametrize("step", [1.0, 20.0, 16.7])
-def test_a_counter_or_a_clock_in_ms_tells_no_rate(robot, clip, tmp_path, step):
+def test_a_counter_or_a_clock_in_ms_gives_no_rate(robot, clip, tmp_path, step):
     path = with_columns(tmp_path / "a.csv", robot, clip, {"time": step * np.arange(40)})
     assert "the file does not say its rate" in refusal(robot, path)
     assert read_motion(robot, path, Reading(fps=50.0)).clip.fps == 50.0
 
 
-def test_a_clock_of_few_decimals_tells_the_rate(robot, clip, tmp_path):
+def test_a_clock_of_few_decimals_gives_the_rate(robot, clip, tmp_path):
     """60 Hz in hundredths of a second: steps of 0.01 and 0.02."""
     path = with_columns(tmp_path / "a.csv", robot, clip, {"time": np.round(np.arange(40) / 60, 2)})
     found = read_motion(robot, path, Reading())

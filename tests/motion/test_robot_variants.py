@@ -47,7 +47,7 @@ def assert_joints(robot, clip, variant, found):
 
 
 @pytest.mark.parametrize("variant", LACKING)
-def test_where_nothing_tells_the_variant_the_user_must(robot, clip, tmp_path, variant):
+def test_where_nothing_decides_the_variant_the_user_must(robot, clip, tmp_path, variant):
     """A quiet clip has the joints of both variants in their ranges."""
     path = pickled(robot, clip, variant, tmp_path / "a.pkl")
     assert all(name in refusal(robot, path) for name in LACKING)

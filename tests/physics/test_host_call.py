@@ -61,7 +61,7 @@ def test_in_a_loop_each_step_is_a_call_and_under_vmap_each_member():
     assert [call.tolist() for call in calls[3:]] == [[1.0, 2.0], [3.0, 4.0]]
 
 
-def test_an_error_is_told_and_the_next_call_works():
+def test_an_error_has_its_message_and_the_next_call_works():
     def halved(x):
         if x[0] < 0.0:
             raise ValueError("found -1; accepted: 0 or more")

@@ -139,17 +139,17 @@ def test_without_a_contact_it_is_the_training_s_engine(robot):
 
 
 @pytest.mark.parametrize("name", ["g1", "h2"])
-def test_every_shape_of_the_robot_is_felt_and_touches_the_others(name):
+def test_every_shape_of_the_robot_has_a_sensor_and_touches_the_others(name):
     robot = load_robot(name)
     assert not robot.model.geom_contype[1:].any()
     model = with_every_contact(robot).model
     assert (model.geom_contype[1:] == 1).all()
-    felt = {model.sensor(sensor).name for sensor in range(model.nsensor)}
-    assert {f"contact_{body}" for body in touching_bodies(robot)} <= felt
+    sensors = {model.sensor(sensor).name for sensor in range(model.nsensor)}
+    assert {f"contact_{body}" for body in touching_bodies(robot)} <= sensors
     assert {model.geom_bodyid[geom] for geom in range(1, model.ngeom)} == {
         model.body(body).id for body in touching_bodies(robot)
     }
-    assert "head_contact_head" in felt
+    assert "head_contact_head" in sensors
     assert robot.model.nsensor == len(robot.key_bodies)  # the training's robot stays as it was
 
 

@@ -172,7 +172,7 @@ def test_warp_has_room_for_every_contact_and_joint_limit(robot, engine):
     assert (PhysicsConfig().warp_contacts, PhysicsConfig().warp_constraints) == PAPER_ROOM
 
 
-def test_warp_that_is_not_installed_is_told_in_one_line(robot, monkeypatch):
+def test_warp_that_is_not_installed_is_refused_in_one_line(robot, monkeypatch):
     monkeypatch.setattr(mujoco.mjx.warp, "WARP_INSTALLED", False)
     with pytest.raises(InputError, match=r"mjx-warp.*pip install 'mujoco-mjx\[warp\]'") as error:
         MjxEngine(robot, SUBSTEPS, implementation="warp")

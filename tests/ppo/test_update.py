@@ -179,7 +179,7 @@ def test_the_value_of_the_state_reached_is_the_next_steps_value_until_the_episod
 
 def test_the_value_after_an_episodes_last_step_is_of_the_state_it_ended_in(run, library):
     state = run.start()
-    # A critic that tells the clip's phase, and episodes of which every other one ends with its first step.
+    # A critic whose value is the clip's phase, and episodes of which every other one ends with its first step.
     critic = jax.tree.map(jnp.zeros_like, state.policy.critic)
     layers = critic["params"]["MLP_0"]
     layers["Dense_0"]["kernel"] = layers["Dense_0"]["kernel"].at[PHASE, 0].set(1.0)

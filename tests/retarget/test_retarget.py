@@ -72,13 +72,13 @@ def test_files_that_are_no_clip(tmp_path, text, expected):
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_source_is_told_before_anything_is_written(robot, tmp_path):
+def test_a_missing_source_is_refused_before_anything_is_written(robot, tmp_path):
     with pytest.raises(InputError, match=r"humanoid3d_walk\.txt"):
         recipe.retarget_library(robot, tmp_path, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-def test_an_unknown_clip_is_told(robot, tmp_path):
+def test_an_unknown_clip_is_refused(robot, tmp_path):
     with pytest.raises(InputError, match="did you mean 'backflip'"):
         recipe.retarget_library(robot, tmp_path, tmp_path / "out", ["backfip"])
 

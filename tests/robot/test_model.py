@@ -217,7 +217,7 @@ def test_shapes_to_be_seen_weigh_nothing_touch_nothing_and_are_not_simulated(nam
         assert sum(body.startswith(side) for body in bodies) > 20
 
 
-def test_only_the_floor_is_touched_unless_self_collision_is_asked_for(g1):
+def test_only_the_floor_is_touched_unless_self_collision_is_on(g1):
     other = load_robot("g1", PhysicsConfig(self_collision=True))
     shapes = np.flatnonzero(g1.model.geom_bodyid > 0)
     assert not g1.model.geom_contype[shapes].any()

@@ -28,7 +28,7 @@ PARTS = {"toe": 2, "heel": 2, "hand": 2, "knee": 1, "elbow": 1}  # floor points 
 
 @pytest.fixture(scope="module")
 def renamed(robot, tmp_path_factory):
-    """The G1 with bodies called part0, part1, ... and joints axle0, axle1, ..., neither of which tells a side."""
+    """The G1 with bodies called part0, part1, ... and joints axle0, axle1, ..., neither of which names a side."""
     folder = tmp_path_factory.mktemp("robots") / "zog"
     folder.mkdir()
     tree = ET.parse(ROBOTS_DIR / "g1/g1.xml")

@@ -101,7 +101,7 @@ def test_a_broken_field_is_one_clear_line(edited, edit, message):
     assert message in found
 
 
-def test_every_fault_is_told_at_once(edited):
+def test_every_fault_is_named_at_once(edited):
     """Of the YAML's fields, and of its names in the MJCF."""
 
     def edit(roles):

@@ -49,7 +49,7 @@ def test_a_preset_names_itself_and_is_valid(name):
     validate(preset(name))
 
 
-def test_an_unknown_preset_is_told():
+def test_an_unknown_preset_is_refused():
     with pytest.raises(InputError, match="preset 'cpus': did you mean 'cpu'"):
         preset("cpus")
 
@@ -143,26 +143,26 @@ def test_the_hash_does_not_see_how_long_or_how_often(name):
         ({"action": {"damping": 3}}, "here: action.damping: found 3; accepted: a table of: a number from 0"),
     ],
 )
-def test_a_bad_setting_is_told_with_its_place_and_what_is_accepted(content, message):
+def test_a_bad_setting_is_refused_with_its_place_and_what_is_accepted(content, message):
     with pytest.raises(InputError) as caught:
         from_dict(Config, content, "here")
     assert str(caught.value).startswith(message)
 
 
-def test_a_missing_file_is_told(path):
+def test_a_missing_file_is_refused(path):
     with pytest.raises(InputError, match=r"config\.yaml: no such config"):
         load_config(path)
 
 
 @pytest.mark.parametrize("content", [b"ppo: [1\n", b"ppo: \xff\n"])
-def test_a_file_that_is_no_yaml_is_told_in_one_line(path, content):
+def test_a_file_that_is_no_yaml_is_refused_in_one_line(path, content):
     path.write_bytes(content)
     with pytest.raises(InputError, match=r"config\.yaml: not YAML") as caught:
         load_config(path)
     assert "\n" not in str(caught.value)
 
 
-def test_an_empty_file_is_told(path):
+def test_an_empty_file_is_refused(path):
     path.write_text("")
     with pytest.raises(InputError, match="accepted: a table of settings"):
         load_config(path)
@@ -221,7 +221,7 @@ def test_the_file_is_plain_yaml(path):
         ),
     ],
 )
-def test_a_number_that_no_run_can_work_with_is_told(config, message):
+def test_a_number_that_no_run_can_work_with_is_refused(config, message):
     with pytest.raises(InputError) as caught:
         validate(config)
     assert str(caught.value).startswith(message)

@@ -70,7 +70,7 @@ def test_no_settings_change_nothing():
         ("ppo.actor_layers=[1", "--set ppo.actor_layers=[1: found '[1'; accepted: a number, a word or [a, list]"),
     ],
 )
-def test_a_bad_setting_is_told_in_one_line(setting, message):
+def test_a_bad_setting_is_refused_in_one_line(setting, message):
     with pytest.raises(InputError) as caught:
         override(Config(), [setting])
     assert str(caught.value).startswith(message)

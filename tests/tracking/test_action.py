@@ -136,7 +136,7 @@ def test_a_setup_has_the_robot_that_its_policy_expects(tiny_config, library_fold
         (ActionConfig(joint_order=("left_knee_joint",) * 29), "action.joint_order: found 29 joints (unknown: none; "),
     ],
 )  # fmt: skip
-def test_joints_that_are_not_the_robots_are_told(action, message):
+def test_joints_that_are_not_the_robots_are_refused(action, message):
     with pytest.raises(InputError) as error:
         load_robot("g1", action=action)
     assert str(error.value).startswith(message)

@@ -427,7 +427,7 @@ def test_noise_is_on_the_actors_observation_alone(puppet_env, assets):
     np.testing.assert_array_equal(noisy_critic, clean_critic)
 
 
-def test_resets_start_new_episodes_where_asked_and_only_there(puppet_env, assets):
+def test_resets_start_new_episodes_in_the_mask_and_only_there(puppet_env, assets):
     state = start(puppet_env, assets, [0, 0, 1, 1], [10, 20, 5, 6])
     state, _ = follow(puppet_env, assets, state, jnp.ones((ENVS, 29)))
     mask = jnp.array([True, False, True, False])

@@ -29,7 +29,7 @@ def test_the_stand_is_the_default_pose_at_rest_as_mujoco_has_it(name):
         np.testing.assert_array_equal(still, 0.0)
 
 
-def test_the_stand_lasts_as_long_as_asked(robot):
+def test_the_stand_has_as_many_frames_as_given(robot):
     library = stand_library(robot, frames=7)
     assert (library.names, int(library.length[0])) == (("stand",), 7)
     np.testing.assert_array_equal(library.frames.joint_pos[6], library.frames.joint_pos[0])

@@ -200,7 +200,7 @@ def test_a_joint_that_only_the_source_has_is_left_out(g1, h2, theirs, carried, c
     np.testing.assert_allclose(back.actor_normalizer.mean, theirs.actor_normalizer.mean, rtol=1e-5, atol=1e-6)
 
 
-def test_a_checkpoint_of_a_robot_that_has_changed_since_is_told(h2, tmp_path):
+def test_a_checkpoint_of_a_robot_that_has_changed_since_is_refused(h2, tmp_path):
     folder = tmp_path / "base"
     shutil.copytree(DATA_DIR / "g1" / "base", folder)
     meta = json.loads((folder / "meta.json").read_text())
@@ -219,6 +219,6 @@ def test_a_checkpoint_of_a_robot_that_has_changed_since_is_told(h2, tmp_path):
         ),
     ],
 )
-def test_a_robot_that_nothing_can_be_had_from_is_told(h2, change, message):
+def test_a_robot_that_nothing_can_be_had_from_is_refused(h2, change, message):
     with pytest.raises(InputError, match=f"base: {message}"):
         policy_for(dataclasses.replace(h2, **change), read_info(DATA_DIR / "g1" / "base"))

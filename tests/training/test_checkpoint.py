@@ -113,7 +113,7 @@ def test_what_the_system_refuses_is_an_oserror_and_leaves_nothing(tmp_path, save
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_full_disk_is_told_before_anything_is_written(tmp_path, state, setup, monkeypatch):
+def test_a_full_disk_is_refused_before_anything_is_written(tmp_path, state, setup, monkeypatch):
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda _path: usage._replace(free=2**20))
     with pytest.raises(OSError, match=r"No space left on device: \d+ MiB are needed") as refusal:
@@ -132,7 +132,7 @@ def test_a_failed_save_leaves_the_one_before(tmp_path, state, setup, template, m
 
 
 @pytest.mark.parametrize(("part", "files"), [("policy.safetensors", 1), ("run/**/*", 4)])
-def test_every_missing_or_damaged_file_is_told_by_name(saved, tmp_path, template, part, files):
+def test_every_missing_or_damaged_file_is_named(saved, tmp_path, template, part, files):
     names = sorted(file.relative_to(saved) for file in saved.glob(part) if file.is_file())
     assert len(names) >= files
     for name in names:
@@ -164,13 +164,13 @@ def edit_note(path: Path, **changes) -> None:
         ('{"schema": 3, "robot": "g1", "joints": [], "clips": [], "library_hash": "", "iteration": "x"}', "damaged: "),
     ],
 )
-def test_a_damaged_note_is_told(copy, content, message):
+def test_a_damaged_note_is_refused(copy, content, message):
     (copy / "meta.json").write_text(content)
     with pytest.raises(InputError, match=rf"copy/meta.json: {message}"):
         read_info(copy)
 
 
-def test_what_is_no_checkpoint_is_told(tmp_path, saved):
+def test_what_is_no_checkpoint_is_refused(tmp_path, saved):
     with pytest.raises(InputError, match="nothing: no such checkpoint folder"):
         read_info(tmp_path / "nothing")
     with pytest.raises(InputError, match=r"neither a checkpoint nor a run: no meta.json$"):
@@ -187,7 +187,7 @@ def test_a_runs_folder_stands_for_its_best_policy_else_its_newest_and_a_librarys
     assert read_info(tmp_path / "library").path == tmp_path / "library" / "base"
 
 
-def test_an_unknown_setting_is_told_with_its_file(copy):
+def test_an_unknown_setting_is_refused_with_its_file(copy):
     settings = yaml.safe_load((copy / "config.yaml").read_text())
     settings["ppo"]["learning_rat"] = settings["ppo"].pop("learning_rate")
     (copy / "config.yaml").write_text(yaml.safe_dump(settings))
@@ -199,7 +199,7 @@ def matches(path: Path, setup: Setup, **options) -> None:
     checkpoint.check_matches(read_info(path), setup, **options)
 
 
-def test_another_robot_or_other_joints_are_told(copy, setup):
+def test_another_robot_or_other_joints_are_refused(copy, setup):
     matches(copy, setup)
     edit_note(copy, robot="h2")
     with pytest.raises(InputError, match=r"copy: robot: the checkpoint's is 'h2' \(\d+ joints\), this run's 'g1'"):
@@ -209,7 +209,7 @@ def test_another_robot_or_other_joints_are_told(copy, setup):
         matches(copy, setup)
 
 
-def test_another_library_is_told_clip_by_clip_and_can_be_allowed(copy, setup):
+def test_another_library_is_refused_clip_by_clip_and_can_be_allowed(copy, setup):
     edit_note(copy, clips=["sway", "turn", "walk"])
     with pytest.raises(InputError, match=r"library: .*\(missing here: walk; new here: nod\)"):
         matches(copy, setup)
@@ -220,7 +220,7 @@ def test_another_library_is_told_clip_by_clip_and_can_be_allowed(copy, setup):
 
 
 @pytest.mark.parametrize("name", ["actor_layers", "critic_layers"])
-def test_another_network_is_told(saved, setup, name):
+def test_another_network_is_refused(saved, setup, name):
     ppo = dataclasses.replace(setup.config.ppo, **{name: (8, 8)})
     other = dataclasses.replace(setup, config=dataclasses.replace(setup.config, ppo=ppo))
     with pytest.raises(InputError, match=rf"ppo.{name}: the checkpoint's is \[16.*\], this run's \[8, 8\]"):
@@ -274,7 +274,7 @@ def test_a_critic_of_another_size_is_refused(copy, robot):
 
 
 def test_a_checkpoint_of_another_layout_does_not_match(copy, setup):
-    other_layout(copy, "root132")  # of the same size, which only the name tells apart
+    other_layout(copy, "root132")  # of the same size, which only the name distinguishes
     message = r"copy: observation.layout: the checkpoint's is root132, this run's wbc132"
     with pytest.raises(InputError, match=rf"{message}$"):
         checkpoint.check_matches(read_info(copy), setup)

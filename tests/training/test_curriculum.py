@@ -135,7 +135,7 @@ def test_lagging_clips_get_three_quarters_of_the_steps_and_mastered_ones_a_kl():
 def test_lagging_ends_when_the_mean_stalls_or_every_clip_is_mastered_or_stuck():
     same = found(0.86, 0.5, 0.1)
     assert phases(LAGGING, same, found(0.86, 0.505, 0.1), first=4) == ["lagging", "stuck kick"]
-    # The flip goes on, and the kick loses as much: no clip of all is better, but the flip has an expert.
+    # The flip rises further, and the kick loses as much: no clip of all is better, but the flip has an expert.
     curve = [found(0.86, 0.48, 0.12), found(0.86, 0.46, 0.14), found(0.86, 0.44, 0.16)]
     assert phases(LAGGING, *curve, first=4) == ["lagging", "distil", "stuck kick"]
     rising = [found(0.86, 0.5 + 0.04 * number, 0.1) for number in range(4)]

@@ -32,7 +32,7 @@ CURVE = [
     ((0.0, 0.0), (0.0, 0.0), (0.3, 0.4)),  # one for the nod, which starts with a search
     ((0.0, 0.0), (0.0, 0.0), (0.9, 0.6)),
     ((0.9, 0.6), (0.9, 0.5), (0.8, 0.6)),  # the distilled policy: the nod's specialist did it better
-    ((0.0, 0.0), (0.0, 0.0), (0.95, 0.7)),  # it goes on
+    ((0.0, 0.0), (0.0, 0.0), (0.95, 0.7)),  # it continues
     ((1.0, 0.7), (1.0, 0.7), (1.0, 0.7)),  # distilled again: all mastered
 ]
 PHASES = [*["broad"] * 3, *["lagging"] * 2, *["stuck"] * 3, "distil", "stuck", "distil"]

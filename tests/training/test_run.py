@@ -280,7 +280,7 @@ def test_a_disk_that_fills_up_leaves_the_checkpoints_before(run):
     assert run(resume=True, iterations=16)[1].iteration == 16
 
 
-def test_a_row_that_does_not_fit_is_told_with_its_folder(run, monkeypatch):
+def test_a_row_that_does_not_fit_is_refused_with_its_folder(run, monkeypatch):
     def full(*_arguments):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -331,13 +331,13 @@ def test_a_folder_with_anything_of_worth_is_not_removed(tmp_path, kept):
     assert (tmp_path / kept).read_text() == "{}"
 
 
-def test_a_folder_without_permission_is_told(tmp_path, monkeypatch):
+def test_a_folder_without_permission_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "access", lambda _path, _mode: False)  # which root would have everywhere
     with pytest.raises(InputError, match=rf"no permission to write in {tmp_path}; choose another --output"):
         prepare_folder(tmp_path / "run", resume=False)
 
 
-def test_nothing_to_resume_is_told(tmp_path):
+def test_nothing_to_resume_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"new: --resume finds no checkpoint there; leave it out to start$"):
         prepare_folder(tmp_path / "new", resume=True)
     assert not (tmp_path / "new").exists()

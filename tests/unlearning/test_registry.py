@@ -21,7 +21,7 @@ def test_every_module_with_a_method_is_one():
     assert all(isinstance(method, Method) for method in methods().values())
 
 
-def test_an_unknown_method_is_told():
+def test_an_unknown_method_is_refused():
     with pytest.raises(InputError, match=r"unlearn\.method: no method 'retrian'; did you mean 'retrain'\?"):
         find_method("retrian")
 

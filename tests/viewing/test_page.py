@@ -116,7 +116,7 @@ def test_the_controls_do_what_they_say(page, library):
     assert not page._obey()
 
 
-def test_it_repeats_only_if_asked_to(page):
+def test_it_repeats_only_if_set_to(page):
     playback = page._playback
     playback.step = playback.last_step
     page._repeat.value = False
