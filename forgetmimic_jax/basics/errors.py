@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import os
 import sys
 from collections.abc import Callable, Iterable
 
@@ -28,16 +29,20 @@ def nearest(name: str, known: Iterable[str]) -> str:
 def run_command(command: Callable[[], None]) -> None:
     """Run a command's body; bad input, a full disk and Ctrl-C end it with one line.
 
-    Exit codes: 2 for bad input or an operating system's refusal, 130 for Ctrl-C. A second Ctrl-C or SIGTERM waits for
-    nothing.
+    Exit codes: 2 for bad input or an operating system's refusal, 130 for Ctrl-C, 141 where nothing reads the output any
+    more (`| head`), as a shell gives them. A second Ctrl-C or SIGTERM waits for nothing.
     """
     draw_later()
     try:
         with second_signal_ends():
             command()
+        sys.stdout.flush()
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more at its end
+        sys.exit(141)
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         print(f"error: {where}{error.strerror or error}", file=sys.stderr)

@@ -82,16 +82,14 @@ def main(study: Study, options: type[Options] = Options, arguments: Iterable[str
     """The command of a study's file; it runs nothing where the named bases or controls are of another robot."""
     from forgetmimic_jax.studies.policies import named_of_other_robots
 
-    program = f"python -m experiments.{study.name}"
-    given = tyro.cli(
-        options,
-        prog=program,
-        description=f"{study.title}{'' if study.title.endswith('?') else '.'} {Options.__doc__}",
-        args=None if arguments is None else list(arguments),
-        config=(tyro.conf.FlagCreatePairsOff,),
-    )
-
     def run() -> None:
+        given = tyro.cli(
+            options,
+            prog=f"python -m experiments.{study.name}",
+            description=f"{study.title}{'' if study.title.endswith('?') else '.'} {Options.__doc__}",
+            args=None if arguments is None else list(arguments),
+            config=(tyro.conf.FlagCreatePairsOff,),
+        )
         others = [] if given.draw else named_of_other_robots(given)
         if others:
             print(f"{study.name}: skipped: it is of the {given.robot}, and {', '.join(others)}")

@@ -1,4 +1,7 @@
 import errno
+import os
+import subprocess
+import sys
 
 import pytest
 
@@ -27,6 +30,17 @@ def test_a_failure_is_one_line_and_an_exit_code(capsys, error, code, line):
         run_command(raising(error))
     assert exit_.value.code == code
     assert capsys.readouterr() == ("", line + "\n")
+
+
+@pytest.mark.parametrize("lines", [1, 100_000])
+def test_a_reader_that_leaves_ends_a_command_without_a_word(lines):
+    """`| head`: the output may be flushed by a print or at the end of the command."""
+    program = f"from forgetmimic_jax.basics.errors import run_command; run_command(lambda: print('a\\n' * {lines}))"
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run([sys.executable, "-c", program], stdout=writer, stderr=subprocess.PIPE, text=True)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (141, "")
 
 
 def test_a_bug_keeps_its_traceback():
