@@ -250,9 +250,10 @@ class Lab:
 
     def as_watched(self, policies: Mapping[str, Path], seed: int) -> dict[str, dict[str, dict[str, float]]]:
         """Policies, clip by clip, on the episodes on which a watched trial of this seed is evaluated."""
-        from forgetmimic_jax.training.watch import clip_means
+        from forgetmimic_jax.training.watch import clip_means, seed_of_episodes
 
-        rolled, names = self.rollouts(policies, episodes=watched_episodes(self.options.episodes), seed=seed)
+        episodes = watched_episodes(self.options.episodes)
+        rolled, names = self.rollouts(policies, episodes=episodes, seed=seed_of_episodes(seed))
         return {key: clip_means(rollout, names) for key, rollout in rolled.items()}
 
     def rollouts(

@@ -118,7 +118,7 @@ def origins(document: Mapping[str, Any]) -> Iterator[str]:
         machine = ""
         if "processor" in group:
             machine = f", Python {group['python']}, JAX {group['jax']}, MuJoCo {group['mujoco']}"
-            machine += f", {group['cores']} cores of {group['processor']}"
+            machine += f", {group['cores']} core{'' if group['cores'] == 1 else 's'} of {group['processor']}"
         which = f": {_runs(group['runs'])}" if len(groups) > 1 else ""
         yield f"- Made by {code_text(group)}{machine}{which}."
 

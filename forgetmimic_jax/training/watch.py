@@ -34,12 +34,22 @@ def clip_means(rollout: Rollout, names: Sequence[str]) -> dict[str, dict[str, fl
     }
 
 
+def seed_of_episodes(seed: int) -> int:
+    """The seed of the episodes on which a run with `seed` is watched.
+
+    The best of many policies is chosen by them and does better on them than on others, so `make evaluate` with the
+    run's own seed has other episodes.
+    """
+    return seed + 1_000_000
+
+
 class Watch:
     """Evaluates a run's policy on the same few episodes each time: a row of evaluations.jsonl, and its PNG."""
 
     def __init__(self, setup: Setup, directory: Path, iteration: int):
         config, self._names = setup.config, setup.library.names
-        self._evaluator = Evaluator(setup, episodes=config.evaluate_episodes, seed=config.seed)
+        seed = seed_of_episodes(config.seed)
+        self._evaluator = Evaluator(setup, episodes=config.evaluate_episodes, seed=seed)
         self._kept = np.isin(
             self._evaluator.clip, [self._names.index(clip) for clip in config.unlearn.targets], invert=True
         )

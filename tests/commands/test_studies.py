@@ -29,8 +29,10 @@ from forgetmimic_jax.studies.options import Options as StudyOptions
 from forgetmimic_jax.studies.targets import targets_study
 from forgetmimic_jax.studies.task import run_task
 from forgetmimic_jax.studies.variants import estimates, summary
+from forgetmimic_jax.tracking.setup import make_setup
 from forgetmimic_jax.training import start
-from forgetmimic_jax.training.checkpoint import policy_hash, read_info
+from forgetmimic_jax.training.checkpoint import load_policy, policy_hash, read_info
+from forgetmimic_jax.training.watch import Watch, clip_means
 from forgetmimic_jax.unlearning.registry import unlearning_config
 
 STUDIES = (
@@ -515,6 +517,15 @@ def test_shipped_bases_and_controls_are_found_without_a_flag(base_run, control, 
     assert of.trial({}, Repeat(1, 0)).folder != of.trial({}, Repeat(0, 0)).folder
     other = Lab(options(StudyOptions, base_run, tmp_path, bases=None, targets="nod"), iterations=2)
     assert other.controls == ()  # the shipped one is of other targets
+
+
+def test_a_policy_is_rolled_out_on_the_episodes_of_a_watched_trial(base_run, tmp_path):
+    of, path = Lab(options(StudyOptions, base_run, tmp_path, episodes=4), iterations=2), base_run.checkpoint(4)
+    setup = make_setup(dataclasses.replace(of.config, seed=3, evaluate_episodes=2))
+    row = Watch(setup, tmp_path, 0).measure(load_policy(read_info(path), setup.robot), 0, 0)
+    assert of.as_watched({"base": path}, seed=3) == {"base": row["clips"]}
+    evaluated, names = of.rollouts({"base": path}, episodes=2, seed=3)
+    assert clip_means(evaluated["base"], names) != row["clips"]  # the best is chosen by other episodes
 
 
 @pytest.mark.parametrize(
