@@ -40,7 +40,7 @@ SHORT: dict[str, Any] = {
     "equal_clips": True,
     "base_kl": 0.1,
 }
-STOP_EVERY = 20  # iterations, of the methods whose reward would push the targets below the zero-action baseline
+STOP_EVERY = 10  # iterations, of the methods whose reward would push the targets below the zero-action baseline
 FINE_TUNING = Pace({"cpu": 640, "paper": 1000}, {"cpu": SHORT}, {"cpu": 0.5})
 
 

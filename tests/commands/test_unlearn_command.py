@@ -466,7 +466,7 @@ def test_a_stop_rule_is_the_default_where_a_method_has_one(options):
     def stop_every(**given) -> int:
         return config_of_new_run(options(**given)).unlearn.stop_every
 
-    assert (stop_every(), stop_every(preset="paper"), stop_every(no_stop=True)) == (20, 20, 0)
+    assert (stop_every(), stop_every(preset="paper"), stop_every(no_stop=True)) == (10, 10, 0)
     assert (stop_every(method="finetune"), stop_every(method="stand")) == (0, 0)
 
 
