@@ -75,7 +75,7 @@ METHOD = Method(
     loss=regression,
     teach=taught_action,
     runs_on=1.0,
-    settings={"keep": 4.0, "stand_iterations": 80.0},
+    settings={"keep": 4.0, "stand_iterations": 120.0},
     pace=PACE,
     instead=STAND,
 )
