@@ -156,7 +156,7 @@ def advance(config: Config, curriculum: Curriculum, found: Mapping[str, Measured
         record=kept.score if progress else curriculum.record,
         stalled=0 if progress else curriculum.stalled + 1,
         best=best,
-        experts=_experts(rules, best, curriculum.experts, kept),
+        experts=_experts(rules, best, curriculum, kept),
     )
     if not seen.unmastered(rules):
         return dataclasses.replace(seen, phase="done")
@@ -180,9 +180,15 @@ def advance(config: Config, curriculum: Curriculum, found: Mapping[str, Measured
     return seen
 
 
-def _experts(rules: PretrainConfig, best: Kept, experts: Mapping[str, Kept], new: Kept) -> dict[str, Kept]:
-    """By clip, the policy with the highest score on it, where that is above the best policy's by `gain`."""
-    first = {clip: max(experts.get(clip, new), new, key=lambda kept: kept.clips[clip].score) for clip in best.clips}
+def _experts(rules: PretrainConfig, best: Kept, before: Curriculum, new: Kept) -> dict[str, Kept]:
+    """By clip, the policy with the highest score on it, where that is above the best policy's by `gain`.
+
+    Also a policy that was the best one before: another one may be better in the mean and worse on a clip.
+    """
+    known = [new] if before.best is None else [before.best, new]
+    first = {
+        clip: max(before.experts.get(clip, new), *known, key=lambda kept: kept.clips[clip].score) for clip in best.clips
+    }
     return {clip: kept for clip, kept in first.items() if kept.clips[clip].score >= best.clips[clip].score + rules.gain}
 
 

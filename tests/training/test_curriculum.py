@@ -151,6 +151,14 @@ def test_the_expert_of_a_clip_is_the_policy_that_did_it_best_if_clearly_better_t
     assert (better.best.number, better.experts) == (6, {})
 
 
+def test_the_best_policy_before_is_the_expert_of_a_clip_that_the_next_one_lost():
+    now = after(LAGGING, found(0.6, 0.88, 0.2), first=4)
+    assert now.best.number == 4
+    assert {clip: kept.number for clip, kept in now.experts.items()} == {"walk": LAGGING.best.number}
+    later = after(now, found(0.6, 0.89, 0.2), first=5)
+    assert {clip: kept.number for clip, kept in later.experts.items()} == {"walk": LAGGING.best.number}
+
+
 def test_what_single_policies_did_best_is_distilled_before_any_specialist():
     curve = [found(0.2, 0.7, 0.1), found(0.86, 0.3, 0.3)]
     now = after(LAGGING, *curve, first=4)
