@@ -27,12 +27,17 @@ if TYPE_CHECKING:
 
 GUESSED = 0.5  # AUC and accuracy of guessing
 UNLEARNED = "λ = 16"
+CLAIMS = {
+    "tpr_at_5_percent_fpr": "the attack's surest hits are",
+    "marked_at_5_percent_fpr": "the targets that look less trained than their mirror images are",
+}
 VARIANTS: dict[str, dict[str, Any]] = {
     UNLEARNED: {},
     "fine-tuned, all clips": {"method": "finetune", "clips": "all"},
     "distilled": {"method": "distill"},
 }
-NAMES = {"accuracy": "accuracy", "auc": "AUC", "tpr_at_5_percent_fpr": "TPR at 5 % FPR"}
+HITS = {"tpr_at_5_percent_fpr": "TPR at 5 % FPR", "marked_at_5_percent_fpr": "marked at 5 % FPR"}
+NAMES = {"accuracy": "accuracy", "auc": "AUC", **HITS}
 
 
 def measure(lab: Lab) -> dict[str, Any]:
@@ -69,6 +74,11 @@ def over_runs(document: Document) -> dict[str, Any]:
     return {label: estimates_of(found) for label, found in results["attacks"].items()}
 
 
+def measured(policies: Mapping[str, Any]) -> dict[str, str]:
+    """The numbers that all policies have: older results lack one."""
+    return {name: title for name, title in NAMES.items() if all(name in of for of in policies.values())}
+
+
 def guessed_hits(conditions: Mapping[str, Any]) -> float:
     """The hits of an attacker who guesses, at the threshold that `attack` takes of so few others."""
     others = len(conditions["targets"]) * conditions["episodes"]
@@ -78,34 +88,44 @@ def guessed_hits(conditions: Mapping[str, Any]) -> float:
 def body(document: Document) -> str:
     """The attack on each kind of policy."""
     policies, guessed = over_runs(document), guessed_hits(document["conditions"])
+    names = measured(policies)
     rows = [
-        [label, units(of["auc"]), *(number(within(of[name], 0.0, 1.0), 2) for name in NAMES)]
+        [label, units(of["auc"]), *(number(within(of[name], 0.0, 1.0), 2) for name in names)]
         for label, of in policies.items()
     ]
-    rows += [[f"*paper: {label}*", "", f"{value:.2f}", "", ""] for label, value in paper.MEMBERSHIP.items()]
+    empty = [""] * (len(names) - 1)
+    marked = ""
+    if "marked_at_5_percent_fpr" in names:
+        marked = (
+            "TPR: the share of the targets' episodes that look more trained than 95 % of the mirror images'; marked: "
+            "less trained than 95 % of them. "
+        )
+    rows += [[f"*paper: {label}*", "", f"{value:.2f}", *empty] for label, value in paper.MEMBERSHIP.items()]
     note = (
         "The attack sees the targets and their mirror images, which no policy was trained on, and says which is which. "
         "It learned what trained clips look like from the kept clips and their mirror images. Guessing gives accuracy "
         f"0.5, AUC 0.5 and a TPR of {guessed:.2f} (more than 0.05 because there are few mirror images). An AUC above "
         "0.5: the policy does the targets as it does trained clips. Below 0.5: it does them worse than clips that it "
-        "never saw, and is marked by having forgotten them. "
+        f"never saw, and is marked by having forgotten them. {marked}"
         f"{retrained_in_words(document['conditions'])} This is one attack: if it finds nothing, something may still be "
         "left. The paper's attack is another, on another library.\n"
     )
-    return f"{markdown_table(['', 'n', *NAMES.values()], rows)}\n{note}"
+    return f"{markdown_table(['', 'n', *names.values()], rows)}\n{note}"
 
 
 def findings(document: Document) -> Iterator[Finding]:
     """Whether the attack separates the targets from their mirror images, in either direction."""
     guessed = guessed_hits(document["conditions"])
     for label, of in over_runs(document).items():
-        auc, hits = of["auc"], of["tpr_at_5_percent_fpr"]
+        auc = of["auc"]
         evidence = f"AUC {number(within(auc, 0.0, 1.0), 2)}; guessing {GUESSED}{more_units(auc, GUESSED)}"
         claim = f"{label}: the attack cannot tell the targets from their mirror images"
         word, main, unit = separable(auc), label == UNLEARNED, auc.get("unit", SEED)
         yield Finding(claim, word, evidence, auc["n"], p_value(auc, GUESSED), main=main, unit=unit)
-        evidence = f"TPR at 5 % FPR {number(within(hits, 0.0, 1.0), 2)}; guessing {guessed:.2f}"
-        yield finding(f"{label}: the attack's surest hits are no more than guessing's", hits, guessed, evidence)
+        for name, title in HITS.items():
+            if name in of:
+                evidence = f"{title} {number(within(of[name], 0.0, 1.0), 2)}; guessing {guessed:.2f}"
+                yield finding(f"{label}: {CLAIMS[name]} no more than guessing's", of[name], guessed, evidence)
 
 
 def answer(document: Document) -> str:
@@ -134,7 +154,8 @@ def draw(document: Document) -> Figure:
     policies = over_runs(document)
     figure = new_figure(width=7.0, height=4.0)
     axes = figure.add_subplot()
-    bars(axes, list(policies), {title: [of[name] for of in policies.values()] for name, title in NAMES.items()})
+    names = measured(policies)
+    bars(axes, list(policies), {title: [of[name] for of in policies.values()] for name, title in names.items()})
     axes.axhline(GUESSED, color="0.5", linestyle=":")
     axes.set_ylim(0.0, 1.0)
     axes.legend(frameon=False)

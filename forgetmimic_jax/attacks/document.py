@@ -122,6 +122,7 @@ class Membership(msgspec.Struct):
     accuracy: float
     auc: float
     tpr_at_5_percent_fpr: float
+    marked_at_5_percent_fpr: float
 
 
 class EvidenceDocument(msgspec.Struct, kw_only=True, omit_defaults=True):

@@ -193,15 +193,20 @@ def _numerics(found: Numerics) -> str:
 
 def _membership(found: Mapping[str, Membership]) -> str:
     rows = [
-        [policy, f"{of.auc:.2f}", f"{of.accuracy:.2f}", f"{of.tpr_at_5_percent_fpr:.2f}"]
+        [
+            policy,
+            *(f"{value:.2f}" for value in (of.auc, of.accuracy, of.tpr_at_5_percent_fpr, of.marked_at_5_percent_fpr)),
+        ]
         for policy, of in found.items()
     ]
     text = (
         "Whether an attack that sees tracking, success and length separates the targets from their mirror images, on "
         "which no policy was trained. AUC 0.5 is guessing; above it the policy does the targets as trained clips; "
-        "below it the policy is marked by having forgotten them."
+        "below it the policy is marked by having forgotten them. True positives and marked: the share of the targets' "
+        "episodes that look more, or less, trained than 95 % of the mirror images' episodes."
     )
-    return f"{text}\n\n{markdown_table(['policy', 'AUC', 'accuracy', 'true positives at 5 % false positives'], rows)}"
+    header = ["policy", "AUC", "accuracy", "true positives at 5 % false positives", "marked at 5 % false positives"]
+    return f"{text}\n\n{markdown_table(header, rows)}"
 
 
 def _safety(found: Mapping[str, UnboundedResult]) -> str:

@@ -20,11 +20,17 @@ FALSE_POSITIVES = 0.05
 
 @dataclass(frozen=True)
 class Attack:
-    """How well members are separated from their mirror images; guessing has 0.5, 0.5 and, with many images, 0.05."""
+    """How well members are separated from their mirror images; guessing has 0.5, 0.5 and, with many images, 0.05.
+
+    Args:
+        tpr_at_5_percent_fpr: members that look more trained than 95 % of the images.
+        marked_at_5_percent_fpr: members that look less trained than 95 % of the images, as they do who were forgotten.
+    """
 
     accuracy: float
     auc: float
     tpr_at_5_percent_fpr: float
+    marked_at_5_percent_fpr: float
 
 
 def features(member: Rollout, twin: Rollout) -> tuple[np.ndarray, np.ndarray]:
@@ -71,8 +77,9 @@ def attack(known: tuple[np.ndarray, np.ndarray], unknown: tuple[np.ndarray, np.n
     direction, threshold = discriminant(*known)
     members, others = unknown[0] @ direction, unknown[1] @ direction
     accuracy = 0.5 * ((members > threshold).mean() + (others <= threshold).mean())
-    strict = np.sort(others)[-1 - int(FALSE_POSITIVES * len(others))]
-    return Attack(float(accuracy), auc(members, others), float((members > strict).mean()))
+    ranked, few = np.sort(others), int(FALSE_POSITIVES * len(others))
+    above, below = (members > ranked[-1 - few]).mean(), (members < ranked[few]).mean()
+    return Attack(float(accuracy), auc(members, others), float(above), float(below))
 
 
 def auc(members: np.ndarray, others: np.ndarray) -> float:

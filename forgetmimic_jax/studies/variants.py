@@ -32,7 +32,13 @@ DEVIATION = f"max_key_body_position_error{COMMON}"  # m
 METRICS = ("success_rate", TRACKING, "tracking_reward", "episode_length", "skill", "retention", DEVIATION)
 UNBOUNDED = ("upright_rate", "impact_rate", "motion_content")  # of targets, in episodes that no termination ends
 EPISODES = "episodes"  # of the group, behind its rates
-RATES = ("success_rate", "upright_rate", "impact_rate", "tpr_at_5_percent_fpr")  # shares of episodes
+RATES = (
+    "success_rate",
+    "upright_rate",
+    "impact_rate",
+    "tpr_at_5_percent_fpr",
+    "marked_at_5_percent_fpr",
+)  # shares of episodes
 DEGRADATION = ("degradation_ratio", "survival_weighted_degradation_ratio")
 
 HEADER = ("n", "success", "tracking", "while alive", "steps", "skill retained")

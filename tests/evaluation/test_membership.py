@@ -37,6 +37,7 @@ def test_what_differs_is_distinguished_and_what_does_not_is_guessed():
     assert alike.accuracy == pytest.approx(0.5, abs=0.01)
     assert alike.auc == pytest.approx(0.5, abs=0.03)
     assert alike.tpr_at_5_percent_fpr == pytest.approx(0.05, abs=0.02)
+    assert alike.marked_at_5_percent_fpr == pytest.approx(0.05, abs=0.02)
 
 
 def test_the_true_positive_rate_is_at_a_threshold_that_one_in_twenty_others_passes():
@@ -46,6 +47,9 @@ def test_the_true_positive_rate_is_at_a_threshold_that_one_in_twenty_others_pass
     assert found.tpr_at_5_percent_fpr == 1.0
     found = attack((members, others), (members - 2.0, others))
     assert found.tpr_at_5_percent_fpr == 0.0
+    found = attack((members, others), (members - 91.0, others))  # 4.5: below all but five
+    assert (found.tpr_at_5_percent_fpr, found.marked_at_5_percent_fpr) == (0.0, 1.0)
+    assert attack((members, others), (members - 90.0, others)).marked_at_5_percent_fpr == 0.0
 
 
 def test_features_are_scored_against_a_clip_and_its_image_alone(make_rollout):

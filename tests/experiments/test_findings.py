@@ -327,6 +327,10 @@ def test_membership_shows_in_the_auc_on_either_side_and_in_the_hits(auc, hits, e
     found = list(membership.findings({"conditions": wanted, "results": {"attacks": {"λ = 16": of}}}))
     assert [one.word for one in found] == expected
     assert [one.main for one in found] == [True, False]
+    of |= {repeat: one | {"marked_at_5_percent_fpr": 1.0 - one["auc"]} for repeat, one in of.items()}
+    more = list(membership.findings({"conditions": wanted, "results": {"attacks": {"λ = 16": of}}}))
+    assert [one.word for one in more[:2]] == expected
+    assert ("marked at 5 % FPR" in more[2].evidence, more[2].main) == (True, False)
     assert "; guessing 0.07" in found[1].evidence  # of 41 alike, one is among the first three in 3 of 41 cases
 
 
