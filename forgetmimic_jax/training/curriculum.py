@@ -200,10 +200,15 @@ def _after_lagging(config: Config, seen: Curriculum, done: float) -> Curriculum:
 
 
 def _specialists(config: Config, seen: Curriculum, clips: list[str], done: float) -> Curriculum:
-    """A specialist for the first of the clips, with its part of the time; without clips or time, distil or end."""
+    """A specialist for the first of the clips; without clips or time, distil or end.
+
+    Its part of the time is that of the score that its clip lacks.
+    """
     left = int((1.0 - done) * config.iterations / config.evaluate_every)
     if clips and left >= 1:
-        longest = min(config.pretrain.specialist_evaluations, max(1, left // len(clips)))
+        assert seen.best is not None
+        lacking = [1.0 - seen.experts.get(clip, seen.best).clips[clip].score for clip in clips]
+        longest = min(config.pretrain.specialist_evaluations, max(1, round(left * lacking[0] / sum(lacking))))
         return _begin(seen, "stuck", specialists=tuple(clips), longest=longest)
     distil = seen.experts and seen.phase != "distil"
     return _begin(seen, "distil") if distil else dataclasses.replace(seen, phase="done")

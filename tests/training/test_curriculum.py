@@ -217,9 +217,11 @@ def test_a_distillation_that_fails_loses_no_expert():
     assert failed.start == failed.experts["kick"] == distil.experts["kick"]
 
 
-def test_specialists_share_the_time_that_is_left():
-    now = advance(CONFIG, LAGGING, found(0.86, 0.501, 0.1), 940)  # six evaluations for two
-    assert (now.phase, now.longest) == ("stuck", 3)
+def test_specialists_share_the_time_that_is_left_as_the_scores_that_are_lacking():
+    now = advance(CONFIG, LAGGING, found(0.86, 0.501, 0.1), 940)  # six evaluations; 0.45 and 0.89 are lacking
+    assert (now.phase, now.longest) == ("stuck", 2)
+    flip = after(now, found(0.3, 0.56, 0.0), found(0.3, 0.6, 0.0), first=95)
+    assert (flip.specialist, flip.longest) == ("flip", 4)
     assert advance(CONFIG, LAGGING, found(0.86, 0.501, 0.1), 1000).phase == "done"
     now = advance(CONFIG, LAGGING, found(0.2, 0.6, 0.1), 1000)
     assert now.phase == "distil"  # it takes no iterations
