@@ -32,17 +32,18 @@ def test_a_base_from_nothing_in_at_most_120_million_steps():
     assert config.ppo == preset("cpu").ppo
 
 
-def test_a_library_of_ones_own_starts_from_the_shipped_base_with_its_observations(library_folder):
+def test_a_library_of_ones_own_starts_from_the_shipped_base_with_its_observations(library_folder, tmp_path):
     shipped = DATA_DIR / "g1" / "base"
     found = config_of(library=library_folder)
     assert found.base == str(shipped)
     assert found.observation == load_config(shipped / "config.yaml").observation
     fresh = config_of(library=library_folder, base=Path("none"))
     assert (fresh.base, fresh.observation) == (None, Config().observation)
-    other = DATA_DIR / "h2" / "base"
+    other = Path(shutil.copytree(DATA_DIR / "h2" / "base", tmp_path / "other"))
+    observation = dataclasses.replace(Config().observation, layout="mjlab154")
+    save_config(dataclasses.replace(load_config(other / "config.yaml"), observation=observation), other / "config.yaml")
     found = config_of(library=library_folder, base=other)
-    assert found.base == str(other)
-    assert found.observation == load_config(other / "config.yaml").observation != Config().observation
+    assert (found.base, found.observation) == (str(other), observation)
 
 
 def test_the_same_command_continues_a_run_from_a_random_policy(library_folder, tmp_path):
