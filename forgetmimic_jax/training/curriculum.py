@@ -171,7 +171,7 @@ def advance(config: Config, curriculum: Curriculum, found: Mapping[str, Measured
             return seen if moving and not stalled and done < rules.lagging_until else _after_lagging(config, seen, done)
         case "stuck":
             moving = seen.clips[seen.specialists[0]].state(rules) in ("new", "learning")
-            if moving and seen.evaluations < seen.longest:
+            if moving and seen.evaluations < seen.longest and done < 1.0:
                 return seen
             unmastered = seen.unmastered(rules)
             return _specialists(config, seen, [name for name in seen.specialists[1:] if name in unmastered], done)

@@ -220,6 +220,8 @@ def test_a_distillation_that_fails_loses_no_expert():
 def test_specialists_share_the_time_that_is_left_as_the_scores_that_are_lacking():
     now = advance(CONFIG, LAGGING, found(0.86, 0.501, 0.1), 940)  # six evaluations; 0.45 and 0.89 are lacking
     assert (now.phase, now.longest) == ("stuck", 2)
+    end = advance(CONFIG, now, found(0.3, 0.56, 0.0), 1000)  # a run that is continued may have fewer iterations
+    assert (end.phase, set(end.experts)) == ("distil", {"kick"})
     flip = after(now, found(0.3, 0.56, 0.0), found(0.3, 0.6, 0.0), first=95)
     assert (flip.specialist, flip.longest) == ("flip", 4)
     assert advance(CONFIG, LAGGING, found(0.86, 0.501, 0.1), 1000).phase == "done"
