@@ -54,4 +54,5 @@ def test_the_stored_pages_are_those_of_the_stored_numbers_and_say_what_made_them
         assert page(study, document) == text, "run `make tables`"
         assert "\n- Made by " in text
         found = answer(study.claim, findings_of(study, document))
-        assert found.n == 3 or found.word == "not measured"
+        runs = 1 if name.endswith("generality") else 3  # it rolls out bases alone, and one is shipped
+        assert found.n == runs or found.word == "not measured"
