@@ -89,7 +89,8 @@ def test_a_sweep_writes_numbers_page_and_figure(swept):
     assert "2 iterations a run with the cpu preset, 2 episodes a clip." in page
     here = provenance()
     assert f"- Made by code {here.code} (commit {here.commit[:7]}), Python {here.python}, JAX {here.jax}, " in page
-    assert f", {here.cores} cores of {here.processor}.\n" in page
+    cores = "1 core" if here.cores == 1 else f"{here.cores} cores"
+    assert f", {cores} of {here.processor}.\n" in page
     assert "## What it says of the claim" in page
     assert "*paper: λ = 16*" in page
     assert "Next: make experiments" in printed
