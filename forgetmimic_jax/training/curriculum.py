@@ -108,7 +108,12 @@ class Curriculum:
     def start(self) -> Kept:
         """The policy that this stage starts from: the best one, or for a specialist its clip's expert."""
         assert self.best is not None
-        return self.experts.get(self.specialist, self.best) if self.specialist else self.best
+        return self.expert(self.specialist) if self.specialist else self.best
+
+    def expert(self, clip: str) -> Kept:
+        """The clip's expert, or without one the best policy."""
+        assert self.best is not None
+        return self.experts.get(clip, self.best)
 
     def states(self, config: PretrainConfig) -> dict[str, ClipState]:
         """The state of every clip."""
@@ -185,9 +190,9 @@ def _experts(rules: PretrainConfig, best: Kept, before: Curriculum, new: Kept) -
 
     Also a policy that was the best one before: another one may be better in the mean and worse on a clip.
     """
-    known = [new] if before.best is None else [before.best, new]
     first = {
-        clip: max(before.experts.get(clip, new), *known, key=lambda kept: kept.clips[clip].score) for clip in best.clips
+        clip: new if before.best is None else max(before.expert(clip), new, key=lambda kept: kept.clips[clip].score)
+        for clip in best.clips
     }
     return {clip: kept for clip, kept in first.items() if kept.clips[clip].score >= best.clips[clip].score + rules.gain}
 
@@ -206,8 +211,7 @@ def _specialists(config: Config, seen: Curriculum, clips: list[str], done: float
     """
     left = int((1.0 - done) * config.iterations / config.evaluate_every)
     if clips and left >= 1:
-        assert seen.best is not None
-        lacking = [1.0 - seen.experts.get(clip, seen.best).clips[clip].score for clip in clips]
+        lacking = [1.0 - seen.expert(clip).clips[clip].score for clip in clips]
         longest = min(config.pretrain.specialist_evaluations, max(1, round(left * lacking[0] / sum(lacking))))
         return _begin(seen, "stuck", specialists=tuple(clips), longest=longest)
     distil = seen.experts and seen.phase != "distil"
