@@ -497,7 +497,7 @@ MUTANTS = (
            "position.state.policy, self._curriculum"),
     Mutant("expert", "forgetmimic_jax/training/curriculum.py", "tests/training/test_curriculum.py",
            "A distillation that fails loses the experts.",
-           "self.experts.get(self.specialist, self.best) if self.specialist else self.best",
+           "self.expert(self.specialist) if self.specialist else self.best",
            "self.best"),
     Mutant("score", "forgetmimic_jax/training/curriculum.py", "tests/training/test_curriculum.py",
            "The score of a clip is its tracking alone.",
