@@ -5,6 +5,7 @@ what was saved continues, and the result is that of a run that nobody killed.
 full: the same with a disk that becomes full, at a random size. It needs Linux with user namespaces.
 inputs: mutated clips, YAML, MJCF, checkpoints, ONNX, pickles and flags (mutations.py). No traceback, no code run.
 random: policies with random weights of random size train for hours. No NaN in a parameter, no growth of memory.
+mjx: whole runs of both robots with MJX, on one CPU core and on two. Each ends in time.
 """
 
 from __future__ import annotations
@@ -59,6 +60,11 @@ PHASES = (  # of pretraining, short enough that a run passes all of them
     *("ppo.schedule=adaptive_iteration", "evaluate_every=4", "evaluate_episodes=4", "pretrain.patience=1"),
     *("pretrain.distil_rounds=2", "pretrain.search_rounds=3", "pretrain.specialist_evaluations=2"),
 )
+MJX = (
+    *("unlearn", "--physics", "mjx", "--iterations", "3", "--episodes", "2"),
+    *("--set", "ppo.num_envs=64", "--set", "ppo.minibatches=2", "--set", "ppo.num_steps=8"),
+)
+MJX_LIMIT = 1800.0  # s; such a run takes some minutes, most of them to compile
 GROWTH = 0.05  # of the memory after a tenth of the time
 PAGE, TMPFS = 2**12, 2**28  # bytes, the least that a disk has, and more than any run here writes
 
@@ -328,6 +334,24 @@ def random_policies(minutes: float, seed: int, say: Callable[[str], None]) -> li
     return faults + [f"memory grew by {grown:.0%}"] * (grown > GROWTH)
 
 
+def mjx_starts(robot: str, cores: Collection[int], times: int, folder: Path) -> list[str]:
+    """Start so many runs that train and evaluate with MJX on these cores; returns the faults."""
+    faults = []
+    for start in range(times):
+        scene = Scene((*MJX, "--robot", robot), "--output", False, evaluated)
+        output = folder / f"{robot}-{len(cores)}-{start}"
+        process = scene.start(output)
+        os.sched_setaffinity(process.pid, cores)  # long before JAX counts the cores
+        try:
+            said, code = process.communicate(timeout=MJX_LIMIT)[0], process.returncode
+        except subprocess.TimeoutExpired:
+            process.kill()
+            said, code = f"not ended after {MJX_LIMIT:.0f} s: {finish(process)[0]}", -1
+        if code != 0:
+            faults.append(f"start {start}: exit code {code}: {said[-300:]}")
+    return faults
+
+
 def resident() -> int:
     """Bytes of memory that this process holds."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
@@ -336,14 +360,16 @@ def resident() -> int:
 def main() -> int:
     """The command; returns its exit code."""
     parser = argparse.ArgumentParser(prog="make soak", description="Kill, fill and mutate.")
-    parser.add_argument("part", nargs="*", help="kill, full, inputs, random (default: all)")
-    parser.add_argument("--times", type=int, default=50, help="kills, disks and mutations of each kind (default: 50)")
-    parser.add_argument("--only", nargs="+", help="commands of kill and full, families of inputs")
+    parser.add_argument("part", nargs="*", help="kill, full, inputs, random, mjx (default: all)")
+    parser.add_argument(
+        "--times", type=int, default=50, help="kills, disks, mutations and starts of each kind (default: 50)"
+    )
+    parser.add_argument("--only", nargs="+", help="commands of kill and full, families of inputs, robots of mjx")
     parser.add_argument("--minutes", type=float, default=120.0, help="of random policies (default: 120)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--keep", type=Path, default=Path("runs/soak"), help="folder for inputs with a fault")
     given = parser.parse_args()
-    parts, rng, found = given.part or ["kill", "full", "inputs", "random"], random.Random(given.seed), {}
+    parts, rng, found = given.part or ["kill", "full", "inputs", "random", "mjx"], random.Random(given.seed), {}
     if "full" in parts and "SOAK_NAMESPACE" not in os.environ:  # to mount disks; its own, nobody else sees them
         os.execvpe("unshare", ["unshare", "-rm", sys.executable, *sys.argv], os.environ | {"SOAK_NAMESPACE": "1"})
     with tempfile.TemporaryDirectory() as name:
@@ -366,6 +392,13 @@ def main() -> int:
                 print(f"inputs {family}: {given.times} times, {len(faults)} faults", flush=True)
     if "random" in parts:
         found["random"] = random_policies(given.minutes, given.seed, lambda line: print(line, flush=True))
+    if "mjx" in parts:
+        with tempfile.TemporaryDirectory() as name:
+            for robot in given.only or ("g1", "h2"):
+                for count in (1, 2):
+                    cores = sorted(os.sched_getaffinity(0))[:count]
+                    found[f"mjx {robot} {count}"] = faults = mjx_starts(robot, cores, given.times, Path(name))
+                    print(f"mjx {robot} on {count}: {given.times} starts, {len(faults)} faults", flush=True)
     faults = [f"{where}: {fault}" for where, some in found.items() for fault in some]
     print("\n".join([*faults, f"{len(faults)} faults"]))
     return 1 if faults else 0

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from forgetmimic_jax.attacks.document import CONTROL, Compared, Originals
-from forgetmimic_jax.attacks.performance import Performance, compare
+from forgetmimic_jax.attacks.performance import Performance, by_clip, compare
 from forgetmimic_jax.attacks.rollouts import Stage
 from forgetmimic_jax.attacks.warping import distances
 from forgetmimic_jax.evaluation.metrics import BASE, UNLEARNED, ZERO_ACTION
@@ -81,6 +81,10 @@ class Case:
         """The numbers of every policy over the episodes of some clips."""
         return compare(performance, performance.of(clips), against=self.against, seed=self.seed)
 
+    def by_clip(self, performance: Performance, clips: Sequence[str]) -> dict[str, Compared]:
+        """The numbers of every policy, clip by clip."""
+        return by_clip(performance, clips, against=self.against, seed=self.seed)
+
     @functools.cached_property
     def on_library(self) -> Performance:
         """Everyone on every clip."""
@@ -109,9 +113,4 @@ class Case:
 
 def originals(case: Case) -> Originals:
     """The clips as they are."""
-    kept = {name: case.compare(case.on_library, [name]) for name in case.kept}
-    return Originals(
-        targets={name: case.compare(case.on_targets, [name]) for name in case.targets},
-        together=case.compare(case.on_targets, case.targets),
-        kept=kept,
-    )
+    return Originals(targets=case.by_clip(case.on_targets, case.targets), kept=case.by_clip(case.on_library, case.kept))

@@ -33,17 +33,16 @@ class Originals(msgspec.Struct):
     """The clips as they are."""
 
     targets: dict[str, Compared]  # by clip
-    together: Compared  # the targets
     kept: dict[str, Compared]  # by clip; only skill and success
 
 
 class NearDuplicates(msgspec.Struct):
     """Variants of the targets, and of the kept clips."""
 
-    families: dict[str, Compared]  # of all targets together
+    families: dict[str, Compared]  # by target and family, as "punch, speed"
     variants: dict[str, Compared]  # by name
     dropped: dict[str, float]  # variants that the base cannot follow: its tracking over that of the original
-    kept: dict[str, Compared]  # by family, of all kept clips together
+    kept: dict[str, Compared]  # by family, over all kept clips
 
     @property
     def worst(self) -> str | None:
@@ -85,11 +84,11 @@ class LookAlikes(msgspec.Struct):
 
 
 class Recovery(msgspec.Struct):
-    """The targets before and after a fine-tuning."""
+    """The targets, or parts of them, before and after a fine-tuning."""
 
     iterations: int
-    before: Compared
-    after: Compared
+    before: dict[str, Compared]  # by clip
+    after: dict[str, Compared]
 
 
 class Curve(msgspec.Struct):
@@ -110,8 +109,8 @@ class Relearning(msgspec.Struct):
 class Numerics(msgspec.Struct):
     """The targets with changed weights, and the success on the kept clips."""
 
-    before: Compared
-    changes: dict[str, Compared]  # by change; `above` is less the same policy before
+    before: dict[str, Compared]  # by target
+    changes: dict[str, dict[str, Compared]]  # by change and target; `above` is less the same policy before
     kept: dict[str, Estimate]  # by change, success of the unlearned policy
     kept_before: Estimate
 

@@ -21,21 +21,25 @@ if TYPE_CHECKING:
 
 
 def what_brought_it_back(evidence: EvidenceDocument) -> dict[str, Compared]:
-    """The numbers on the targets as they are and after each attack; of several variants those that brought most."""
-    found = {"as it is": evidence.originals.together}
+    """The numbers as they are and after each attack: of all targets and variants, those of which most is left."""
+    target, compared = _most(evidence.originals.targets)
+    found = {f"as it is:\n{target}": compared}
     if evidence.near_duplicates and evidence.near_duplicates.families:
         family, compared = _most(evidence.near_duplicates.families)
         found[f"near-duplicates:\n{family}"] = compared
     if evidence.splices and evidence.splices.forbidden:
         found["spliced into\nkept clips"] = evidence.splices.forbidden
     if evidence.recovery:
-        found["fine-tuned on\nkept clips"] = evidence.recovery.after
+        target, compared = _most(evidence.recovery.after)
+        found[f"fine-tuned on kept\nclips: {target}"] = compared
     if evidence.relearning:
         found["relearning, equal\ntarget steps (tracking)"] = _relearned(evidence.relearning)
     if evidence.held_out:
-        found["first half shown:\nsecond half"] = evidence.held_out.after
+        target, compared = _most(evidence.held_out.after)
+        found[f"first half shown:\n{target}"] = compared
     if evidence.numerics:
-        change, compared = _most(evidence.numerics.changes)
+        groups = {f"{change}: {at}": of for change, by in evidence.numerics.changes.items() for at, of in by.items()}
+        change, compared = _most(groups)
         found[f"weights in\n{change}"] = compared
     return found
 

@@ -165,7 +165,7 @@ def attack(case: Case) -> NearDuplicates:
     for target in case.targets:
         blended_with = clips[case.nearest[target][0]]
         for family, variants in near_duplicates(robot, clips[target], blended_with, case.seed).items():
-            families.setdefault(family, []).extend(variant.name for variant in variants)
+            families[f"{target}, {family}"] = [variant.name for variant in variants]
             originals |= {variant.name: target for variant in variants}
             made += variants
     performance = case.stage(made, case.scale.variant_episodes).perform(case.everyone)
@@ -173,7 +173,7 @@ def attack(case: Case) -> NearDuplicates:
     kept, kept_dropped = _of_kept(case)
     return NearDuplicates(
         families=_compared(case, performance, families, dropped),
-        variants={name: case.compare(performance, [name]) for name in originals if name not in dropped},
+        variants=case.by_clip(performance, [name for name in originals if name not in dropped]),
         dropped=dropped | kept_dropped,
         kept=kept,
     )

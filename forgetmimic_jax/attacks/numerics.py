@@ -13,12 +13,11 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import msgspec
-import numpy as np
 from jax import Array
 
 from forgetmimic_jax.attacks.case import Case
 from forgetmimic_jax.attacks.document import Numerics
-from forgetmimic_jax.attacks.performance import Performance, compare
+from forgetmimic_jax.attacks.performance import Performance, by_clip
 from forgetmimic_jax.evaluation import statistics
 from forgetmimic_jax.evaluation.document import Estimate
 from forgetmimic_jax.evaluation.metrics import UNLEARNED
@@ -84,16 +83,18 @@ def attack(case: Case) -> Numerics:
     }
     words = {f"{name}, {change}": of for (name, change), of in versions.items()}
     performance = case.on_targets.joined(case.target_stage.perform(words))
-    every = np.ones(len(performance.clip), bool)
     against = {f"{name}, {change}": name for name, change in versions}
-    compared = compare(performance, every, against=against, seed=case.seed, policies=list(against))
+    compared = by_clip(performance, case.targets, against=against, seed=case.seed, policies=list(against))
     stage = case.stage(case.chosen(case.kept), case.scale.kept_variant_episodes)
     ours = {change: versions[UNLEARNED, change] for change in CHANGES}
     on_kept = stage.perform({"before": case.policies[UNLEARNED], **ours})
     success = {name: _success(on_kept, name) for name in on_kept.length}
     return Numerics(
-        before=case.compare(case.on_targets, case.targets),
-        changes={change: {name: compared[f"{name}, {change}"] for name in policies} for change in CHANGES},
+        before=case.by_clip(case.on_targets, case.targets),
+        changes={
+            change: {target: {name: of[f"{name}, {change}"] for name in policies} for target, of in compared.items()}
+            for change in CHANGES
+        },
         kept_before=success.pop("before"),
         kept=success,
     )

@@ -80,7 +80,7 @@ def _conditions(evidence: EvidenceDocument, command: str) -> str:
 
 def _blocks(evidence: EvidenceDocument) -> Iterable[Block]:
     originals = evidence.originals
-    yield "The targets as they are", _table("target", {**originals.targets, "together": originals.together})
+    yield "The targets as they are", _table("target", originals.targets)
     if evidence.near_duplicates:
         yield "Near-duplicates", _near_duplicates(evidence.near_duplicates)
     if evidence.splices:
@@ -161,11 +161,14 @@ def _look_alikes(found: LookAlikes) -> str:
 
 
 def _recovery(found: Recovery) -> str:
-    policies = [policy for policy in TRAINED if policy in found.after]
-    numbers = found.after[UNLEARNED]
-    above = f"skill {percent(numbers.skill_above)}, motion content {number(numbers.content_above, 2)}"
-    table = _table("", {"before": found.before, f"after {found.iterations} iterations": found.after}, policies)
-    return f"{table}\nThe unlearned policy above the control afterwards: {above}."
+    above: list[str] = []
+    rows: dict[str, Compared] = {}
+    for clip, after in found.after.items():
+        rows |= {f"{clip}, before": found.before[clip], f"{clip}, after {found.iterations} iterations": after}
+        skill, content = after[UNLEARNED].skill_above, after[UNLEARNED].content_above
+        above.append(f"{clip}: skill {percent(skill)}, motion content {number(content, 2)}")
+    policies = [policy for policy in TRAINED if all(policy in after for after in found.after.values())]
+    return f"{_table('', rows, policies)}\nThe unlearned policy above the control afterwards: {'; '.join(above)}."
 
 
 def _relearning(found: Relearning) -> str:
@@ -185,10 +188,14 @@ def _relearning(found: Relearning) -> str:
 
 
 def _numerics(found: Numerics) -> str:
-    table = _table("weights", {"as they are": found.before, **found.changes})
+    by_clip: dict[str, Compared] = {}
+    for clip, before in found.before.items():
+        changes = {f"{clip}, {change}": of[clip] for change, of in found.changes.items()}
+        by_clip |= {f"{clip}, as they are": before, **changes}
     success = {"as they are": found.kept_before, **found.kept}
     rows = [[name, percent(value)] for name, value in success.items()]
-    return f"{table}\n{markdown_table(['weights', 'unlearned: success on the kept clips'], rows)}"
+    table = markdown_table(["weights", "unlearned: success on the kept clips"], rows)
+    return f"{_table('weights', by_clip)}\n{table}"
 
 
 def _membership(found: Mapping[str, Membership]) -> str:

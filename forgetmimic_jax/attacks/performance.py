@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -116,6 +117,11 @@ def compare(
             numbers.content_above = _mean(content[name] - content[other], weights)
         found[name] = numbers
     return found
+
+
+def by_clip(performance: Performance, clips: Sequence[str], **given: Any) -> dict[str, Compared]:
+    """`compare` for each clip alone, since a mean over targets can hide one that is still known."""
+    return {name: compare(performance, performance.of([name]), **given) for name in clips}
 
 
 def over_seeds(seeds: Sequence[Compared]) -> Compared:

@@ -9,12 +9,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
-
 from forgetmimic_jax.attacks.case import TRAINED, Case
 from forgetmimic_jax.attacks.document import CONTROL, Recovery
 from forgetmimic_jax.attacks.fine_tuning import FineTuning, shares
-from forgetmimic_jax.attacks.performance import Performance, compare, over_seeds
+from forgetmimic_jax.attacks.performance import Performance, by_clip, over_seeds
 from forgetmimic_jax.attacks.rollouts import Stage
 from forgetmimic_jax.evaluation.metrics import UNLEARNED
 from forgetmimic_jax.policy.policy import Policy
@@ -67,7 +65,6 @@ def before_and_after(case: Case, workshop: Workshop, plan: Plan, stage: Stage, b
         stage: the episodes.
         before: how everyone did in them.
     """
-    every = np.ones(len(before.clip), bool)
 
     def trained(policy: str, seed: int) -> Policy:
         start = case.policies[policy]
@@ -87,10 +84,12 @@ def before_and_after(case: Case, workshop: Workshop, plan: Plan, stage: Stage, b
         new = {f"after {policy}": trained(policy, seed) for policy in plan.policies}
         against = {f"after {UNLEARNED}": f"after {CONTROL}"}
         both = before.joined(stage.perform(new))
-        found = compare(both, every, against=against, seed=case.seed, policies=list(new))
-        afterwards.append({policy: found[f"after {policy}"] for policy in plan.policies})
+        found = by_clip(both, both.names, against=against, seed=case.seed, policies=list(new))
+        afterwards.append(
+            {clip: {policy: of[f"after {policy}"] for policy in plan.policies} for clip, of in found.items()}
+        )
     return Recovery(
         iterations=plan.iterations,
-        before=compare(before, every, against=case.against, seed=case.seed),
-        after=over_seeds(afterwards),
+        before=case.by_clip(before, before.names),
+        after={clip: over_seeds([seed[clip] for seed in afterwards]) for clip in before.names},
     )

@@ -51,7 +51,7 @@ _NO_SKILL = "The base itself is hardly better than the zero-action baseline on e
 RULES = {
     CONSISTENT: (
         f"Forgotten: {_FORGOTTEN}. Kept: {_KEPT}. Not recovered: fine-tuned on the kept clips alone, its skill and its "
-        f"motion content on the targets are at most {RECOVERED:g} above the control's after the same training; with "
+        f"motion content on every target are at most {RECOVERED:g} above the control's after the same training; with "
         f"other numerics at most {RECOVERED:g} above its own before; and with every seed it needs at least "
         f"{share(FASTER)} of the control's target steps to relearn {share(DECISIVE)} of the base's tracking, or "
         f"tracks at most {share(CLOSE)} of the base's more after the same target steps where neither gets there. All "
@@ -120,7 +120,7 @@ def judge_evaluation(policy: PolicyResult) -> Verdict:
         clips = {name: clip for name, clip in policy.clips.items() if clip.target == target}
         return {name: {UNLEARNED: Numbers(skill=clip.skill)} for name, clip in clips.items()}
 
-    originals = Originals(targets=numbers(True), together={}, kept=numbers(False))
+    originals = Originals(targets=numbers(True), kept=numbers(False))
     failures, doubts = _of_clips(originals, beside=False)
     if failures:
         return Verdict(FAILED, tuple(failures))
@@ -234,8 +234,8 @@ def recoveries(evidence: EvidenceDocument, no_control: str = "") -> Iterator[tup
     if evidence.numerics is None:
         yield None, "Other numerics were not measured."
         return
-    for change, compared in evidence.numerics.changes.items():
-        yield from _rises(compared[UNLEARNED], f"Weights in {change}", "its own before")
+    for change, marks in evidence.numerics.changes.items():
+        yield from _rises(marks, f"Weights in {change}", "its own before")
 
 
 def _recovery(evidence: EvidenceDocument) -> Iterator[tuple[bool | None, str]]:
@@ -244,17 +244,18 @@ def _recovery(evidence: EvidenceDocument) -> Iterator[tuple[bool | None, str]]:
         yield None, "Retain-only recovery was not measured."
         return
     attack = f"Fine-tuned on the kept clips alone for {recovery.iterations} iterations"
-    yield from _rises(recovery.after[UNLEARNED], attack, "the control's after the same training")
+    yield from _rises(recovery.after, attack, "the control's after the same training")
 
 
-def _rises(numbers: Numbers, attack: str, other: str) -> Iterator[tuple[bool | None, str]]:
-    """Whether skill and content rose above the other's by more than `RECOVERED`."""
-    for kind in ("skill", "content"):
-        own, above = as_skill(getattr(numbers, kind)), as_skill(getattr(numbers, f"{kind}_above"))
-        if own is None or above is None:
-            continue
-        rose = True if above.low > RECOVERED else False if above.high <= RECOVERED else None
-        yield rose, f"{attack}: {_words(kind, own)} on the targets, {_signed(kind, above)} above {other}."
+def _rises(marks: Marks, attack: str, other: str) -> Iterator[tuple[bool | None, str]]:
+    """Whether skill and content rose above the other's by more than `RECOVERED`, target by target."""
+    for target, numbers in _numbers(marks):
+        for kind in ("skill", "content"):
+            own, above = as_skill(getattr(numbers, kind)), as_skill(getattr(numbers, f"{kind}_above"))
+            if own is None or above is None:
+                continue
+            rose = True if above.low > RECOVERED else False if above.high <= RECOVERED else None
+            yield rose, f"{attack}: {_words(kind, own)} on {target}, {_signed(kind, above)} above {other}."
 
 
 def _why_no_control(originals: Originals) -> str:

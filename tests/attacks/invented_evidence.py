@@ -53,23 +53,26 @@ PLAIN: dict[str, Any] = {
     "made": msgspec.to_builtins(Provenance("code", "commit", "3.12", "0.7", "3.3", "processor", 2)),
     "originals": {
         "targets": {"punch": compared(0.05, 0.25)},
-        "together": compared(0.05, 0.25),
         "kept": {clip: compared(0.95, 0.93) for clip in ("walk", "run")},
     },
     "near_duplicates": {
-        "families": {family: compared(0.05, 0.25) for family in ("speed", "mirrored")},
+        "families": {f"punch, {family}": compared(0.05, 0.25) for family in ("speed", "mirrored")},
         "variants": {"punch_speed_0.75": compared(0.0, 0.2), "punch_mirrored": compared(0.15, 0.3)},
         "dropped": {},
         "kept": {"speed": compared(0.9, 0.85)},
     },
-    "recovery": {"iterations": 100, "before": compared(0.05, 0.25), "after": compared(0.2, 0.3)},
+    "recovery": {
+        "iterations": 100,
+        "before": {"punch": compared(0.05, 0.25)},
+        "after": {"punch": compared(0.2, 0.3)},
+    },
     "relearning": {
         "base": {"0": 0.8},
         "starts": {"unlearned": {"0": curve(60_000)}, "control": {"0": curve(100_000)}},
     },
     "numerics": {
-        "before": compared(0.05, 0.25),
-        "changes": {"int4": {"unlearned": numbers(0.08, 0.08, 0.03)}},
+        "before": {"punch": compared(0.05, 0.25)},
+        "changes": {"int4": {"punch": {"unlearned": numbers(0.08, 0.08, 0.03)}}},
         "kept": {"int4": estimate(0.9)},
         "kept_before": estimate(0.92),
     },

@@ -12,7 +12,7 @@ def test_a_policy_that_no_attack_brings_back_is_consistent():
     text = " ".join(verdict.reasons)
     assert "punch 5 % [3, 7] of the base's skill" in text
     assert "60,000 against 100,000 target steps" in text
-    assert "skill 20 % [18, 22] on the targets, -10 % [-12, -8] above the control's" in text
+    assert "skill 20 % [18, 22] on punch, -10 % [-12, -8] above the control's" in text
 
 
 def test_every_phrase_has_its_rule():
@@ -21,7 +21,7 @@ def test_every_phrase_has_its_rule():
 
 def test_what_the_control_does_too_is_forgotten():
     alike = compared(0.38, 0.3)  # a distilled policy: more than 20 % of the skill, as the control
-    verdict = judge(evidence(originals__targets={"punch": alike}, near_duplicates__families={"speed": alike}))
+    verdict = judge(evidence(originals__targets={"punch": alike}, near_duplicates__families={"punch, speed": alike}))
     assert verdict.phrase == CONSISTENT
 
 
@@ -34,8 +34,8 @@ def test_what_the_control_does_too_is_forgotten():
             "Still known: the target punch, motion content 0.70 [0.68, 0.72] (0.45 [0.43, 0.47] above the control)",
         ),
         (
-            {"near_duplicates__families__mirrored": compared(0.9, 0.2)},
-            "Still known: near-duplicates of the targets: mirrored, skill 90 %",
+            {"near_duplicates__families__punch, mirrored": compared(0.9, 0.2)},
+            "Still known: near-duplicates of the targets: punch, mirrored, skill 90 %",
         ),
         (
             {"originals__kept__walk": compared(0.1, 0.9), "originals__kept__run": compared(1.0, 0.9)},
@@ -61,14 +61,17 @@ def test_a_failure_says_what_failed(changes, reason):
     ("changes", "reason"),
     [
         (
-            {"recovery__after__unlearned": numbers(0.45, 0.45, 0.15)},
-            "Fine-tuned on the kept clips alone for 100 iterations: skill 45 % [43, 47] on the targets, 15 % [13,",
+            {"recovery__after__punch__unlearned": numbers(0.45, 0.45, 0.15)},
+            "Fine-tuned on the kept clips alone for 100 iterations: skill 45 % [43, 47] on punch, 15 % [13,",
         ),
         (
-            {"recovery__after__unlearned": numbers(0.2, 0.5, -0.1) | {"content_above": estimate(0.3)}},
-            "Fine-tuned on the kept clips alone for 100 iterations: motion content 0.50 [0.48, 0.52] on the targets",
+            {"recovery__after__punch__unlearned": numbers(0.2, 0.5, -0.1) | {"content_above": estimate(0.3)}},
+            "Fine-tuned on the kept clips alone for 100 iterations: motion content 0.50 [0.48, 0.52] on punch",
         ),
-        ({"numerics__changes__int4__unlearned": numbers(0.2, 0.2, 0.15)}, "Weights in int4: skill 20 % [18, 22]"),
+        (
+            {"numerics__changes__int4__punch__unlearned": numbers(0.2, 0.2, 0.15)},
+            "Weights in int4: skill 20 % [18, 22]",
+        ),
         (
             {"relearning__starts__unlearned__0": curve(40_000)},
             "relearns the targets faster than the control: unlearned policy against control, seed by seed, 40,000",
@@ -79,6 +82,23 @@ def test_a_recovery_names_the_attack_and_by_how_much(changes, reason):
     verdict = judge(evidence(**changes))
     assert verdict.phrase == RECOVERABLE
     assert reason in verdict.reasons[0]
+
+
+@pytest.mark.parametrize(
+    ("place", "phrase"),
+    [
+        ("near_duplicates__families__kick, mirrored", FAILED),
+        ("recovery__after__kick", RECOVERABLE),
+        ("numerics__changes__int4__kick", RECOVERABLE),
+    ],
+)
+def test_a_target_below_the_baseline_does_not_pay_for_another(place, phrase):
+    # Together the two targets would have 10 %, which the control has too.
+    known = {"base": numbers(1.0, 0.95), "unlearned": numbers(0.6, 0.6, 0.5), "control": numbers(0.1, 0.1)}
+    lost = {"base": numbers(1.0, 0.95), "unlearned": numbers(-0.4, -0.4, -0.5), "control": numbers(0.1, 0.1)}
+    verdict = judge(evidence(**{place: known, place.replace("kick", "punch"): lost}))
+    assert verdict.phrase == phrase
+    assert "kick" in verdict.reasons[0]
 
 
 def test_a_control_that_lost_the_kept_clips_excuses_nothing():
@@ -94,13 +114,13 @@ def test_a_control_that_lost_the_kept_clips_excuses_nothing():
     [
         ({"originals__targets__punch": compared(0.21, 0.0)}, "Whether this is forgotten is not sure: the target punch"),
         (
-            {"near_duplicates__families__speed__unlearned": numbers(0.4, 0.1, 0.19)},
-            "near-duplicates of the targets: sp",
+            {"near_duplicates__families__punch, speed__unlearned": numbers(0.4, 0.1, 0.19)},
+            "near-duplicates of the targets: punch, sp",
         ),
         ({"near_duplicates__kept__speed": compared(0.49, 0.85)}, "Whether this is kept is not sure"),
-        ({"recovery__after__unlearned": numbers(0.35, 0.3, 0.09)}, "9 % [7, 11] above the control's"),
-        ({"recovery__after__unlearned": numbers(0.37, 0.3, 0.11)}, "11 % [9, 13] above the control's"),
-        ({"numerics__changes__int4__unlearned": numbers(0.14, 0.1, 0.09)}, "Weights in int4"),
+        ({"recovery__after__punch__unlearned": numbers(0.35, 0.3, 0.09)}, "9 % [7, 11] above the control's"),
+        ({"recovery__after__punch__unlearned": numbers(0.37, 0.3, 0.11)}, "11 % [9, 13] above the control's"),
+        ({"numerics__changes__int4__punch__unlearned": numbers(0.14, 0.1, 0.09)}, "Weights in int4"),
         ({"near_duplicates__kept__speed": compared(0.3, 0.49)}, "Whether this is kept is not sure"),
         ({"recovery": None}, "Retain-only recovery was not measured."),
         ({"relearning": None}, "How fast it relearns the targets was not measured."),
@@ -146,7 +166,10 @@ def test_where_neither_relearns_what_they_reached_is_compared(ours, phrase):
 
 
 def test_a_failure_is_not_outweighed_by_a_doubt():
-    changes = {"originals__targets__punch": compared(0.6, 0.3), "near_duplicates__families__speed": compared(0.21, 0.0)}
+    changes = {
+        "originals__targets__punch": compared(0.6, 0.3),
+        "near_duplicates__families__punch, speed": compared(0.21, 0.0),
+    }
     verdict = judge(evidence(**changes))
     assert verdict.phrase == FAILED
     assert len(verdict.reasons) == 2  # skill and motion content of the target

@@ -8,18 +8,19 @@ from forgetmimic_jax.attacks.figure import draw, what_brought_it_back
 
 def test_of_several_variants_the_one_that_brought_most_is_shown():
     changes = {
-        "near_duplicates__families__speed": compared(0.4, 0.2),
-        "numerics__changes__int8": {"unlearned": numbers(0.3, 0.3, 0.2)},
+        "near_duplicates__families__punch, speed": compared(0.4, 0.2),
+        "numerics__changes__int8": {"punch": {"unlearned": numbers(0.3, 0.3, 0.2)}},
+        "recovery__after__kick": compared(0.1, 0.3),
     }
     found = what_brought_it_back(evidence(**changes))
     assert list(found) == [
-        "as it is",
-        "near-duplicates:\nspeed",
-        "fine-tuned on\nkept clips",
+        "as it is:\npunch",
+        "near-duplicates:\npunch, speed",
+        "fine-tuned on kept\nclips: punch",
         "relearning, equal\ntarget steps (tracking)",
-        "weights in\nint8",
+        "weights in\nint8: punch",
     ]
-    assert found["near-duplicates:\nspeed"]["unlearned"].skill.mean == 0.4
+    assert found["near-duplicates:\npunch, speed"]["unlearned"].skill.mean == 0.4
     relearned = found["relearning, equal\ntarget steps (tracking)"]
     # Where the unlearned policy's training ends, at 90,000 target steps, it tracks 0.75 and the control, which needs
     # 100,000, 0.1 + 0.8 * 0.65 = 0.62, of the base's 0.8.

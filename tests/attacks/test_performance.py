@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from forgetmimic_jax.attacks.document import Numbers, read_evidence, write_document
-from forgetmimic_jax.attacks.performance import Performance, compare, not_followed, over_seeds
+from forgetmimic_jax.attacks.performance import Performance, by_clip, compare, not_followed, over_seeds
 
 
 def performance(**tracking: list[float]) -> Performance:
@@ -50,6 +50,14 @@ def test_skill_and_what_is_above_the_control(measured):
     assert first.skill.mean == pytest.approx(0.1 / 0.6)
     assert first.skill_above.mean == pytest.approx(-0.1 / 0.6)
     assert first.skill_above.low <= -0.1 / 0.6 <= first.skill_above.high
+
+
+def test_each_clip_has_numbers_of_its_own(measured):
+    found = by_clip(measured, ["a", "b"], against={"unlearned": "control"}, seed=0)
+    # Clip b: base 0.9, zero action 0.1, unlearned 0.2, control 0.1.
+    assert found["a"]["unlearned"].skill.mean == pytest.approx(0.1 / 0.6)
+    assert found["b"]["unlearned"].skill.mean == pytest.approx(0.1 / 0.8)
+    assert found["b"]["unlearned"].skill_above.mean == pytest.approx(0.1 / 0.8)
 
 
 def test_a_base_that_hardly_beats_the_baseline_has_no_skill_to_retain():

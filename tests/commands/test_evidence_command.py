@@ -63,10 +63,11 @@ def test_every_attack_is_in_the_document(run, printed, base_run):
     assert document.targets == ["turn"]
     assert document.policy_hashes["unlearned"] == policy_hash(read_info(run / "checkpoints" / "00000002"))
     assert document.policy_hashes["base"] == policy_hash(read_info(base_run.checkpoint(4)))
-    assert set(document.recovery.after) == {"base", "unlearned", "control"}
+    assert document.recovery.after.keys() == document.recovery.before.keys() == {"turn"}
+    assert set(document.recovery.after["turn"]) == {"base", "unlearned", "control"}
     assert set(document.near_duplicates.families) <= {
-        "speed", "mirrored", "amplitude", "turned", "noise", "half", "blended"
-    }  # fmt: skip
+        f"turn, {family}" for family in ("speed", "mirrored", "amplitude", "turned", "noise", "half", "blended")
+    }
     assert judge(document).phrase in printed
 
 
