@@ -1,7 +1,7 @@
 # Every command of the README. The first one makes .venv (once, a few minutes); after that each starts at once.
 # Works with GNU make 3.81 (macOS) and later.
 
-# `make TARGET VARIABLE=value ...`: a variable is a flag of the target's command, so SEED=1 is --seed 1. The command has
+# `make COMMAND VARIABLE=value ...`: a variable is a flag of the command, so SEED=1 is --seed 1. The command has
 # its own default for every flag that is not given.
 ## ROBOT        a folder under robots/ (default: g1)
 ## TARGETS      clips to forget, comma-separated (default: the robot's; g1: punch,kick)
@@ -47,7 +47,7 @@ STUDIES = validity comparison penalty heat_map motion_types physical_behaviour t
 .PHONY: help $(COMMANDS) sweep experiments tables test mutants soak lint format clean
 
 help: ## this list
-	@echo 'make TARGET [VARIABLE=value ...]'
+	@echo 'make COMMAND [VARIABLE=value ...]'
 	@echo
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' Makefile | \
 		while IFS='|' read -r name text; do printf '  %-13s %s\n' "$$name" "$$text"; done

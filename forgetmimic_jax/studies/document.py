@@ -22,6 +22,7 @@ from forgetmimic_jax.basics.provenance import provenance
 from forgetmimic_jax.evaluation.repeats import Repeat
 
 SCHEMA = 3
+DECIDING = ("code", "jax", "mujoco")  # fields of `Provenance` that decide a run's numbers
 DIGITS = 9  # significant ones of a number
 
 
@@ -91,14 +92,18 @@ def same_bases(document: Mapping[str, Any], conditions: Mapping[str, Any]) -> bo
 def check_same_code(path: Path, document: Mapping[str, Any], *, mix: bool) -> None:
     """A study may only add runs to those of its JSON if the same code made them, or if the user mixes them.
 
+    Code is the package's, with the versions of JAX and MuJoCo.
+
     Raises:
         InputError: other code made them.
     """
-    here = provenance().code
-    others = [group for group in document["made_by"] if group["code"] != here]
+    here = dataclasses.asdict(provenance())
+    others = [
+        group for group in document["made_by"] if any(group.get(name, here[name]) != here[name] for name in DECIDING)
+    ]
     if not others:
         return
-    codes = " and ".join(code_text(group) for group in others)
+    codes = " and ".join(code_text(group) + _versions(group) for group in others)
     if not all(group["code"] for group in others):
         raise InputError(
             f"{path}: made by {codes}, which this study cannot continue; choose another --output, or remove the file "
@@ -106,8 +111,8 @@ def check_same_code(path: Path, document: Mapping[str, Any], *, mix: bool) -> No
         )
     if not mix:
         raise InputError(
-            f"{path}: made by {codes}, and this is code {here}; --mix-commits puts their runs into one table, another "
-            "--output keeps them apart"
+            f"{path}: made by {codes}, and this is code {here['code']}{_versions(here)}; --mix-commits puts their "
+            "runs into one table, another --output keeps them apart"
         )
 
 
@@ -115,6 +120,10 @@ def code_text(group: Mapping[str, Any]) -> str:
     """The code of a group of `made_by` in words."""
     commit = f"commit {group['commit'][:7]}" if "commit" in group else "commit unknown"
     return f"code {group['code']} ({commit})" if group["code"] else f"older code (stored with {commit})"
+
+
+def _versions(group: Mapping[str, Any]) -> str:
+    return f" with JAX {group['jax']} and MuJoCo {group['mujoco']}" if {"jax", "mujoco"} <= group.keys() else ""
 
 
 def known_trials(folder: Path) -> dict[str, Known]:

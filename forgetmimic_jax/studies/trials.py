@@ -68,8 +68,8 @@ def make_trial(root: Path, options: Mapping[str, Any]) -> Trial:
     """The trial with these options of `unlearn`, by name.
 
     Its folder is METHOD-TARGETS-sSEED-DIGEST-CODE in `root`. DIGEST is over every setting, the number of evaluation
-    episodes, and the contents of base, clips and robot; CODE is over the package's Python files. Where base and clips
-    lie, and who wrote them down when, does not count.
+    episodes, the contents of base, clips and robot, and the versions of JAX and MuJoCo; CODE is over the package's
+    Python files. Where base and clips lie, and who wrote them down when, does not count.
     """
     given = Options(**{**options, "set": [list(options.get("set", []))]})
     config = config_of(given)
@@ -98,8 +98,10 @@ def _content(info: CheckpointInfo) -> list[Any]:
 
 
 def _folder(root: Path, kind: str, targets: Sequence[str], seed: int, content: Any) -> Path:
+    here = provenance()
+    content = [content, here.jax, here.mujoco]
     digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:8]
-    return root / "-".join([kind, "+".join(targets), f"s{seed}", digest, provenance().code])
+    return root / "-".join([kind, "+".join(targets), f"s{seed}", digest, here.code])
 
 
 def without_code(name: str) -> str:

@@ -179,7 +179,7 @@ _LAYOUTS = (
         "joint_vel": 0.5,
         "actions": 0.0,
     }),
-    # The shipped bases': wbc132 with the reference's floating base in the anchor's place.
+    # wbc132 with the reference's floating base in the anchor's place; earlier shipped bases have it.
     Layout("root132", {
         "ref_root_height": 0.01,
         "ref_root_lin_vel_b": (0.1, 0.1, 0.05),

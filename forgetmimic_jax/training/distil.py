@@ -250,7 +250,7 @@ def score_of(env: Environment, assets: Assets, teaching: Teaching, student: Poli
 
 
 def _learned(config: DistilConfig, learning: Array, normalizer: Normalizer, observation: Array) -> Normalizer:
-    """The statistics with a batch [..., features] where `learning` []; no variance below the floor."""
+    """The statistics with a batch [..., features] where `learning` []; no variance below `variance_floor`."""
     new = normalizer.updated(observation)
     new = dataclasses.replace(new, variance=jnp.maximum(new.variance, config.variance_floor))
     return jax.tree.map(lambda new, old: jnp.where(learning, new, old), new, normalizer)

@@ -50,6 +50,19 @@ def settles_from(skills: Sequence[tuple[int, float]]) -> int | None:
     return None
 
 
+def retained(policy: np.ndarray, base: np.ndarray, zero_action: np.ndarray) -> float:
+    """Skill that is left, as a mean over the target clips; a negative skill counts as 0, so it pays for no other clip.
+
+    NaN where the base is hardly better than the zero action on every clip.
+
+    Args:
+        policy, base, zero_action: f[clip] survival-weighted tracking.
+    """
+    defined = base - zero_action >= metrics.MINIMUM_SKILL_RANGE
+    skill = metrics.skill(policy[defined], base[defined], zero_action[defined])
+    return float(np.maximum(skill, 0.0).mean()) if defined.any() else float("nan")
+
+
 class Targets:
     """The targets' skill on a few episodes, the same each time; base and zero action are rolled out once."""
 
@@ -60,13 +73,14 @@ class Targets:
         self._base, self._zero = self._tracking(setup.base), self._tracking(None)
 
     def skill(self, policy: Policy) -> float:
-        """(SWT − SWT of zero action) / (SWT of the base − SWT of zero action), over all target clips."""
-        return float(metrics.skill(self._tracking(policy), self._base, self._zero))
+        """See `retained`."""
+        return retained(self._tracking(policy), self._base, self._zero)
 
     def _tracking(self, policy: Policy | None) -> np.ndarray:
-        """Mean survival-weighted tracking []."""
-        found = metrics.episode_metrics(self._evaluator.rollout(policy))
-        return np.asarray(found["survival_weighted_tracking"].mean())
+        """Mean survival-weighted tracking f[clip]."""
+        rollout = self._evaluator.rollout(policy)
+        tracked = metrics.episode_metrics(rollout)["survival_weighted_tracking"]
+        return np.array([tracked[rollout.clip == clip].mean() for clip in np.unique(rollout.clip)])
 
 
 class Stopping(Plain):

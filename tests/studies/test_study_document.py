@@ -18,6 +18,7 @@ from forgetmimic_jax.studies.document import (
 )
 
 HERE = dataclasses.asdict(provenance())
+VERSIONS = f" with JAX {HERE['jax']} and MuJoCo {HERE['mujoco']}"
 OTHER = {**HERE, "code": "0123abcd", "commit": "f" * 40}
 
 
@@ -79,9 +80,11 @@ def test_runs_of_other_code_are_only_added_to_where_the_user_mixes_them(tmp_path
     with pytest.raises(InputError) as refused:
         check_same_code(path, document([HERE, OTHER]), mix=False)
     assert str(refused.value) == (
-        f"{path}: made by code 0123abcd (commit fffffff), and this is code {HERE['code']}; --mix-commits puts their "
-        "runs into one table, another --output keeps them apart"
+        f"{path}: made by code 0123abcd (commit fffffff){VERSIONS}, and this is code {HERE['code']}{VERSIONS}; "
+        "--mix-commits puts their runs into one table, another --output keeps them apart"
     )
+    with pytest.raises(InputError, match=rf"made by code {HERE['code']} .* with JAX 0.4.1 and MuJoCo"):
+        check_same_code(path, document([HERE, {**HERE, "jax": "0.4.1"}]), mix=False)
     older = {"code": "", "commit": "abc1234" + 33 * "0"}
     for mix in (False, True):
         with pytest.raises(InputError, match=r"made by older code \(stored with commit abc1234\), which this"):

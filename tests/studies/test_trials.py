@@ -70,12 +70,16 @@ def test_a_default_that_changes_makes_another_trial(tmp_path, base, monkeypatch)
     assert make_trial(tmp_path, {"base": base, "iterations": 5}).folder != before.folder
 
 
-def test_other_code_makes_another_trial(tmp_path, base, monkeypatch):
+def test_other_code_or_versions_make_another_trial(tmp_path, base, monkeypatch):
     found = [make_trial(tmp_path, {"base": base, "iterations": 5}).folder.name]
     other = dataclasses.replace(provenance(), code="0123abcd")
     monkeypatch.setattr(trials, "provenance", lambda: other)
     found.append(make_trial(tmp_path, {"base": base, "iterations": 5}).folder.name)
     assert found[1] == f"{without_code(found[0])}-0123abcd"
+    other = dataclasses.replace(provenance(), mujoco="2.3.0")
+    monkeypatch.setattr(trials, "provenance", lambda: other)
+    found.append(make_trial(tmp_path, {"base": base, "iterations": 5}).folder.name)
+    assert without_code(found[2]) != without_code(found[0])
 
 
 @pytest.mark.parametrize("note", ["evaluation.json", "checkpoints/00000005/meta.json"])

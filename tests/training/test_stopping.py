@@ -3,6 +3,7 @@
 import dataclasses
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from rich.console import Console
 
@@ -10,7 +11,7 @@ from forgetmimic_jax.settings.config import UnlearnConfig
 from forgetmimic_jax.tracking.env import make_assets
 from forgetmimic_jax.training import stopping
 from forgetmimic_jax.training.course import Position
-from forgetmimic_jax.training.stopping import Stopping, settles_from
+from forgetmimic_jax.training.stopping import Stopping, retained, settles_from
 
 
 @pytest.mark.parametrize(
@@ -27,6 +28,14 @@ from forgetmimic_jax.training.stopping import Stopping, settles_from
 )
 def test_a_run_settles_from_the_second_look_in_a_row_at_the_baseline(curve, expected):
     assert settles_from([(20 * (i + 1), skill) for i, skill in enumerate(curve)]) == expected
+
+
+def test_a_target_below_the_baseline_does_not_pay_for_another():
+    base, zero = np.array([0.9, 0.8, 0.22]), np.array([0.1, 0.2, 0.2])
+    # 49 % and -29 %: their mean would be 10 %. The third clip's base is hardly better than the zero action.
+    policy = np.array([0.1 + 0.49 * 0.8, 0.2 - 0.29 * 0.6, 0.9])
+    assert retained(policy, base, zero) == pytest.approx(0.245)
+    assert np.isnan(retained(policy, zero, zero))
 
 
 @pytest.fixture
