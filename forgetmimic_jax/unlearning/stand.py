@@ -70,12 +70,12 @@ def regression(config: Config, batch: Batch, now: Prediction, iteration: Array) 
 # A regression: the number of gradient steps decides, they may be large, and a rollout serves many of them.
 SHORT_REGRESSION = {**SHORT, "branches": 1, "minibatches": 12, "epochs": 4, "learning_rate": 1.5e-3}
 # A user starts a clip at its first frame, and that frame may be the hardest of all.
-PACE = Pace({"cpu": 140, "paper": 400}, {"cpu": SHORT_REGRESSION}, {"cpu": 0.5}, first_frame=0.5)
+PACE = Pace({"cpu": 100, "paper": 400}, {"cpu": SHORT_REGRESSION}, {"cpu": 0.5}, first_frame=0.5)
 METHOD = Method(
     loss=regression,
     teach=taught_action,
     runs_on=1.0,
-    settings={"keep": 4.0, "stand_iterations": 120.0},
+    settings={"keep": 4.0, "stand_iterations": 160.0},
     pace=PACE,
     instead=STAND,
 )
