@@ -2,31 +2,20 @@
 # Works with GNU make 3.81 (macOS) and later.
 
 # `make COMMAND VARIABLE=value ...`: a variable is a flag of the command, so SEED=1 is --seed 1. The command has
-# its own default for every flag that is not given.
+# its own default for every flag that is not given. These are the variables that most runs need; `make COMMAND
+# ARGS=--help` lists the flags, and so all variables of a command.
 ## ROBOT        a folder under robots/ (default: g1)
 ## TARGETS      clips to forget, comma-separated (default: the robot's; g1: punch,kick)
 ## METHOD       how to forget; `make unlearn ARGS=--help` names them (default: arft)
 ## LAMBDA       the penalty λ on the targets' tracking reward, --penalty (default: 16)
-## PRESET       cpu or paper (default: cpu)
 ## LIBRARY      folder of clips (default: data/ROBOT)
 ## BASE         the policy to start from (default: the shipped one; for pretrain and train, none)
-## BASES        the policies that sweep and experiments start from, comma-separated (default: the shipped one; for
-##              experiments every data/ROBOT/base*)
-## CONTROLS     retrained controls for the experiments, comma-separated (default: every data/ROBOT/control*)
-## WITHOUT      clips that pretrain leaves out, comma-separated, which makes a retrained control (default: none)
 ## CHECKPOINT   the policy to evaluate, export, play or film (default: the shipped base; to play or film, all shipped)
-## BESIDE       more checkpoints to play or film beside it, comma-separated
 ## RUN          folder of the run to attack, or to report on; to attack several, comma-separated
 ## OUTPUT       where the results go (default: under runs/)
-## NOISE        1 evaluates with randomisation, pushes and sensor noise
 ## RESUME       1 continues the run in OUTPUT
 ## SWEEP        lambda, targets, sampler or seeds (default: lambda)
-## DEVICES      devices that share one training, such as 4; for bench the numbers to compare, such as 1,2,4 (default: 1)
-## SEEDS        runs of each kind for sweep and experiments (default: 3, from several bases 1); for pretrain so many
-##              trainings, each in a folder of its own
-## JOBS         of these, so many at a time on this machine
-## CLUSTER      address of a dask scheduler whose workers run them (docs/cluster.md; default: none)
-## ARGS         flags as they are, and what comes before them; ARGS=--help lists all flags
+## ARGS         flags as they are, and what comes before them; ARGS=--help lists all flags, which are variables too
 ## PYTHON       the Python that .venv is made from, 3.11 to 3.14 (default: the first found)
 PROGRAM = .venv/bin/python -m forgetmimic_jax
 SWITCHES = RESUME NOISE WRENCH DRAW DRY FORCE MIX_COMMITS NO_STOP FULL FAKES KEEP_HEIGHT FILL_MISSING
