@@ -23,6 +23,7 @@ from forgetmimic_jax.basics.files import read_rows, write_atomically
 from forgetmimic_jax.basics.provenance import PACKAGE, provenance
 from forgetmimic_jax.studies.process import CODE
 
+PROC = Path("/proc")  # of Linux: what the kernel says of processes
 ATTEMPTS = 3  # at a task whose process the system kills
 POLL = 1.0  # s between two questions whether a running task is still wanted
 # Environment variables that say how many threads to use: to `provenance.cores`, to XLA, and to BLAS.
@@ -65,7 +66,7 @@ class Task:
 
     @property
     def mark(self) -> Path:
-        """While a worker runs the task: a file with the worker's host and process."""
+        """While a worker runs the task: a file with the worker's host, process and the process's start."""
         return self.folder.with_name(f"{self.folder.name}.running")
 
     @property
@@ -133,19 +134,36 @@ def _marked(task: Task) -> Iterator[None]:
     Raises:
         InputError: another process of this machine runs the task.
     """
-    mine = f"{platform.node()} {os.getpid()}"
+    mine = f"{platform.node()} {os.getpid()} {_start_of(os.getpid())}"
     try:
         with task.mark.open("x") as file:
             file.write(mine)
     except FileExistsError:
-        host, _, process = task.mark.read_text().partition(" ")
-        if host == platform.node() and process.isdigit() and _is_alive(int(process)):
+        if (process := _at_work(task.mark.read_text())) is not None:
             raise InputError(f"process {process} runs it") from None
         write_atomically(task.mark, mine.encode())
     try:
         yield
     finally:
         task.mark.unlink(missing_ok=True)
+
+
+def _at_work(mark: str) -> int | None:
+    """The process of a mark, if it still runs on this machine; its number alone may be another process's by now."""
+    host, process, start = (*mark.split(), "", "", "")[:3]
+    if host != platform.node() or not process.isdigit() or not _is_alive(int(process)):
+        return None
+    return int(process) if _start_of(int(process)) in ("", start) else None
+
+
+def _start_of(process: int) -> str:
+    """When a process started: the boot's identity and clock ticks since then; empty where the system does not say."""
+    try:
+        boot = (PROC / "sys/kernel/random/boot_id").read_text().strip()
+        fields = (PROC / str(process) / "stat").read_text().rpartition(")")[2].split()  # from the third on
+    except OSError:
+        return ""
+    return f"{boot}:{fields[19]}"
 
 
 def _is_alive(process: int) -> bool:

@@ -51,6 +51,9 @@ note("end")
 """
 
 
+START = task._start_of(os.getpid())
+
+
 @pytest.fixture(autouse=True)
 def quick(tmp_path, monkeypatch):
     script = tmp_path / "run"
@@ -176,14 +179,36 @@ def test_a_process_that_is_killed_each_time_fails(tmp_path):
     assert journal(tmp_path) == ["start 6", *["start 6+"] * (ATTEMPTS - 1)]
 
 
-def test_a_task_at_which_another_process_works_is_left_to_it(tmp_path):
+@pytest.mark.parametrize("system", ["Linux", "macOS"])
+def test_a_task_at_which_another_process_works_is_left_to_it(tmp_path, monkeypatch, system):
+    if system == "macOS":
+        monkeypatch.setattr(task, "PROC", tmp_path / "none")
     wanted = [a_task(tmp_path, seed) for seed in (2, 3)]
     wanted[0].mark.parent.mkdir(parents=True)
-    mark = f"{task.platform.node()} {os.getppid()}"
+    mark = f"{task.platform.node()} {os.getppid()} {task._start_of(os.getppid())}"
     wanted[0].mark.write_text(mark)
     assert run_tasks(wanted, jobs=1, description="try") == {wanted[0]: f"process {os.getppid()} runs it"}
     assert journal(tmp_path) == ["start 3", "end 3"]
     assert wanted[0].mark.read_text() == mark
+
+
+def test_a_process_does_not_take_a_task_twice(tmp_path):
+    wanted = a_task(tmp_path, 2)
+    wanted.mark.parent.mkdir(parents=True)
+    with task._marked(wanted):
+        assert run_tasks([wanted], jobs=1, description="try") == {wanted: f"process {os.getpid()} runs it"}
+    assert run_tasks([wanted], jobs=1, description="try") == {}
+
+
+@pytest.mark.skipif(not START, reason="the system does not say when a process started")
+@pytest.mark.parametrize("process", [os.getpid, os.getppid])
+@pytest.mark.parametrize("start", ["", f"{START}0", f"0{START}"], ids=["unknown", "another", "another boot"])
+def test_the_mark_of_a_process_that_had_the_number_before_is_replaced(tmp_path, process, start):
+    wanted = a_task(tmp_path, 2)
+    wanted.mark.parent.mkdir(parents=True)
+    wanted.mark.write_text(f"{task.platform.node()} {process()} {start}")
+    assert run_tasks([wanted], jobs=1, description="try") == {}
+    assert not wanted.mark.exists()
 
 
 @pytest.mark.parametrize("mark", ["", "gone", f"{task.platform.node()} 4194304", "another-host 1"])
