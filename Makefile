@@ -24,7 +24,7 @@
 ## DEVICES      devices that share one training, such as 4; for bench the numbers to compare, such as 1,2,4 (default: 1)
 ## SEEDS        runs of each kind for sweep and experiments (default: 3, from several bases 1); for pretrain so many
 ##              trainings, each in a folder of its own
-## JOBS         of these, so many at a time on this machine
+## JOBS         of these, so many at a time on this machine (default: one on each GPU)
 ## CLUSTER      address of a dask scheduler whose workers run them (docs/cluster.md; default: none)
 ## ARGS         flags as they are, and what comes before them; ARGS=--help lists all flags
 ## PYTHON       the Python that .venv is made from, 3.11 to 3.14 (default: the first found)

@@ -1,6 +1,7 @@
 """Tasks on this machine. The process here is a few lines that write what a run writes, so that only the care counts."""
 
 import contextlib
+import itertools
 import os
 import re
 import signal
@@ -18,7 +19,7 @@ from waiting import until
 from forgetmimic_jax.basics.errors import InputError, Interrupted
 from forgetmimic_jax.basics.provenance import cores, provenance
 from forgetmimic_jax.studies import executor, task
-from forgetmimic_jax.studies.executor import RESOURCE, on_cluster, run_tasks, run_together
+from forgetmimic_jax.studies.executor import RESOURCE, at_a_time, on_cluster, run_tasks, run_together
 from forgetmimic_jax.studies.process import CODE
 from forgetmimic_jax.studies.task import ATTEMPTS, Task, run_task
 
@@ -45,6 +46,8 @@ if flag["--seed"] == "6" or flag["--seed"] == "7" and "--resume" not in sys.argv
     os.kill(os.getpid(), signal.SIGKILL)
 if flag["--seed"] == "5":
     (folder / "threads").write_text(" ".join(os.environ[name] for name in ("PYTHON_CPU_COUNT", "NPROC")))
+if flag["--seed"] in "23":
+    (folder / "gpu").write_text(os.environ.get("CUDA_VISIBLE_DEVICES", "all"))
 time.sleep(60 if flag["--seed"] == "9" else 0.2)
 (folder / flag.get("--last", "evaluation.json")).write_text("{{}}")
 note("end")
@@ -61,6 +64,7 @@ def quick(tmp_path, monkeypatch):
     script.chmod(0o755)
     monkeypatch.setattr(task.sys, "executable", str(script))
     monkeypatch.setattr(executor, "POLL", 0.02)
+    monkeypatch.setattr(executor, "gpus", list)
 
 
 def a_task(tmp_path: Path, seed: int) -> Task:
@@ -142,6 +146,28 @@ def test_a_task_has_its_share_of_the_cores(tmp_path, monkeypatch):
         run_tasks([wanted], jobs=jobs, description="try")
         assert (wanted.folder / "threads").read_text() == f"{share} {share}"
         (wanted.folder / "evaluation.json").unlink()
+
+
+@pytest.mark.parametrize(("there", "seen"), [([], {"all"}), (["4", "GPU-7"], {"4", "GPU-7"}), (["4"], {"4"})])
+def test_every_task_has_a_gpu_for_itself(tmp_path, monkeypatch, there, seen):
+    monkeypatch.setattr(executor, "gpus", lambda: there)
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    wanted = [a_task(tmp_path, seed) for seed in (2, 3)]
+    for _ in range(2):  # a GPU is free again after its task
+        run_tasks(wanted, jobs=2, description="try")
+        assert {(one.folder / "gpu").read_text() for one in wanted} == seen
+        for one in wanted:
+            (one.folder / "evaluation.json").unlink()
+    most = max(itertools.accumulate(1 if line.startswith("start") else -1 for line in journal(tmp_path)))
+    assert most == (len(there) or 2)
+
+
+def test_by_default_one_task_runs_on_each_gpu_and_more_are_refused(monkeypatch):
+    assert (at_a_time(None, None), at_a_time(None, None, few=2), at_a_time(3, None)) == (1, 2, 3)
+    monkeypatch.setattr(executor, "gpus", lambda: ["4", "5"])
+    assert (at_a_time(None, None), at_a_time(2, None), at_a_time(3, "tcp://a:8786")) == (2, 2, 3)
+    with pytest.raises(InputError, match=r"^--jobs: found 3; accepted: 1 to 2, since each takes one of the GPUs$"):
+        at_a_time(3, None)
 
 
 def test_a_task_that_is_given_twice_runs_once(tmp_path):
