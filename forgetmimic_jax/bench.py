@@ -39,7 +39,8 @@ class Options:
     repeats: int = 7
     """Times each measurement is taken; the median counts, rounds of all measurements alternate."""
     dry: bool = False
-    """Simulate nothing; print the memory that an iteration needs, as XLA computes it."""
+    """Simulate nothing; print the memory that an iteration needs, as XLA computes it. The preset paper takes the engine
+    of a GPU then, unless --physics names another."""
     devices: str | None = None
     """Numbers of devices to compare, such as 1,2,4: how fast an iteration is on each (docs/cluster.md)."""
     against: str | None = None
@@ -75,7 +76,11 @@ def main(options: Options) -> None:
         from forgetmimic_jax.training.devices import join
 
         config = replace_given(preset(options.preset), robot=options.robot, library=options.library)
-        config = dataclasses.replace(on_engine(config, options.physics), devices=counts[0] if counts else 1)
+        physics = options.physics
+        if options.dry and options.preset == "paper" and physics is None:
+            physics = "mjx"
+            print("--physics: mjx, the engine of this preset on a GPU, also where there is none")
+        config = dataclasses.replace(on_engine(config, physics), devices=counts[0] if counts else 1)
         join(config)
         setup = make_setup(config)
         if options.dry:

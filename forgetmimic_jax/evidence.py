@@ -50,8 +50,9 @@ class Options:
     """Iterations of a control that is made; the method's by default."""
     fakes: bool = False
     """Judge the judge too: six fakes, which must fail, and another distilled policy, which must not (an hour)."""
-    jobs: int = 1
-    """With several runs, so many at a time on this machine; they share its cores evenly."""
+    jobs: int | None = None
+    """With several runs, so many at a time on this machine, which share its cores evenly; by default one on each GPU,
+    or 1 without a GPU."""
     cluster: str | None = None
     """Address of a dask scheduler, such as tcp://host:8786, whose workers attack the runs (docs/cluster.md)."""
 
@@ -148,17 +149,17 @@ def _several(options: Options, runs: Sequence[Path]) -> None:
     """The evidence on each run, in a process of its own."""
     from forgetmimic_jax.attacks.document import FILE
     from forgetmimic_jax.basics.console import command_line
-    from forgetmimic_jax.studies.executor import run_together
+    from forgetmimic_jax.studies.executor import at_a_time, run_together
     from forgetmimic_jax.studies.task import Task
 
-    at_least(1, "--jobs", options.jobs)
+    jobs = at_a_time(options.jobs, options.cluster)
     tasks = []
     for run in runs:
         _unlearned(run)
-        flags = flags_of(dataclasses.replace(options, run=str(run), jobs=1, cluster=None))
+        flags = flags_of(dataclasses.replace(options, run=str(run), jobs=None, cluster=None))
         tasks.append(Task(run, "evidence", flags, iterations=0, last=FILE, adds=True))
     following = command_line("report", run=runs[0])
-    run_together(tasks, following, description="evidence", jobs=options.jobs, cluster=options.cluster)
+    run_together(tasks, following, description="evidence", jobs=jobs, cluster=options.cluster)
 
 
 def _scale(options: Options) -> Scale:

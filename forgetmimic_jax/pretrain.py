@@ -66,8 +66,9 @@ class Options(train.Options):
     seeds: int | None = None
     """Train so many policies, with the seeds SEED, SEED + 1, ..., each in the folder OUTPUT-ITS_SEED. The same command
     continues those that were stopped."""
-    jobs: int = 1
-    """With --seeds, trainings at a time on this machine; they share its cores evenly."""
+    jobs: int | None = None
+    """With --seeds, trainings at a time on this machine, which share its cores evenly; by default one on each GPU, or 1
+    without a GPU."""
     cluster: str | None = None
     """With --seeds, address of a dask scheduler, such as tcp://host:8786, whose workers train (docs/cluster.md)."""
 
@@ -111,17 +112,17 @@ def main(options: Options) -> None:
 def _several(options: Options, output: Path) -> None:
     """A training of each seed, in a process of its own."""
     from forgetmimic_jax.basics.console import command_line
-    from forgetmimic_jax.studies.executor import run_together
+    from forgetmimic_jax.studies.executor import at_a_time, run_together
     from forgetmimic_jax.studies.task import Task
     from forgetmimic_jax.training.folder import check_writable
 
     assert options.seeds is not None
     at_least(1, "--seeds", options.seeds)
-    at_least(1, "--jobs", options.jobs)
+    jobs = at_a_time(options.jobs, options.cluster)
     if options.resume:
         raise InputError("--resume: found with --seeds; leave it out: the same command continues what was stopped")
     check_writable(output)
-    alone = dataclasses.replace(options, seeds=None, jobs=1, cluster=None, output=None)
+    alone = dataclasses.replace(options, seeds=None, jobs=None, cluster=None, output=None)
     first, tasks = options.seed or 0, []
     for seed in range(first, first + options.seeds):
         one, folder = dataclasses.replace(alone, seed=seed), output.with_name(f"{output.name}-{seed}")
@@ -131,7 +132,7 @@ def _several(options: Options, output: Path) -> None:
         tasks.append(Task(folder, "pretrain", flags_of(one), config.iterations))
     following = command_line("evaluate", robot=options.robot, checkpoint=tasks[0].folder)
     what = f"pretrain {options.robot}"
-    run_together(tasks, following, description=what, jobs=options.jobs, cluster=options.cluster)
+    run_together(tasks, following, description=what, jobs=jobs, cluster=options.cluster)
 
 
 def check_alone(options: Options) -> None:

@@ -63,6 +63,7 @@ from forgetmimic_jax.training import checkpoint
 from forgetmimic_jax.training.start import base_folder
 
 LIMIT = 120  # s for one file, on a busy machine; a reader that needs longer hangs
+MJLAB = "B_HandsUp_mjlab.npz"  # a motion of SHARED
 WORDS = ("", "nan", "inf", "-1", "0", "1e308", "99999999999", "null", "[]", "{}", "!!python/object/apply:os.abort []")
 COMMANDS = {
     "train": train, "unlearn": unlearn, "evaluate": evaluate, "evidence": evidence, "export": export, "play": play,
@@ -157,6 +158,9 @@ def _motion(folder: Path, name: str) -> tuple[list[Path], Callable[[], object]]:
         clip = invented_clip(robot, "turn", 41, 1.0, 0.2)
         rows = np.concatenate([clip.root_pos, np.roll(clip.root_quat, -1, axis=-1), clip.joint_pos], axis=-1)
         np.savetxt(path, rows, delimiter=",", fmt="%.6f")
+    elif name == "compressed.npz":
+        with np.load(SHARED / "motions" / MJLAB) as archive:
+            np.savez_compressed(path, **archive)
     else:
         shutil.copyfile(SHARED / "motions" / name, path)
     fps, library = 30.0 if path.suffix == ".csv" else None, folder / "library"
@@ -257,7 +261,8 @@ def _policy(folder: Path, name: str) -> tuple[list[Path], Callable[[], object]]:
 
 FAMILIES: dict[str, Family] = {
     "csv": lambda folder: _motion(folder, "motion.csv"),
-    "npz": lambda folder: _motion(folder, "B_HandsUp_mjlab.npz"),
+    "npz": lambda folder: _motion(folder, MJLAB),
+    "compressed": lambda folder: _motion(folder, "compressed.npz"),
     "pickle": lambda folder: _motion(folder, "yanjie_walk_001_gmr.pkl"),
     "library": _library,
     "robot": _robot,
@@ -268,7 +273,7 @@ FAMILIES: dict[str, Family] = {
     "pt": _pt,
     "deploy": lambda folder: _policy(folder, "unitree_rl_lab_dance_102/policy.onnx"),
 }
-OF_OTHERS = ("npz", "pickle", "onnx", "deploy")  # families of files in SHARED
+OF_OTHERS = ("npz", "compressed", "pickle", "onnx", "deploy")  # families of files in SHARED
 
 
 def flags(rng: random.Random) -> None:

@@ -5,7 +5,10 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import sys
 import tempfile
+import warnings
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +23,30 @@ def check_no_pointer(path: Path) -> None:
         with path.open("rb") as file:
             if file.read(len(POINTER)) == POINTER:
                 raise InputError(f"{path}: this is a Git LFS pointer, not the file: run git lfs pull")
+
+
+@contextlib.contextmanager
+def readable(path: Path, kind: str) -> Iterator[None]:
+    """Inside, whatever the readers of archives, arrays and pickles raise becomes InputError: no readable `kind`.
+
+    They raise almost anything for a damaged file: zlib.error and LZMAError, RuntimeError for an encrypted member,
+    NotImplementedError for an unknown compression, tokenize.TokenError and IndexError for an array's header. What they
+    warn of is not shown.
+    """
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            yield
+    except (InputError, FileNotFoundError):
+        raise
+    except Exception as error:
+        raise InputError(f"{path}: not a readable {kind} ({type(error).__name__}: {error})") from None
+
+
+def check_characters(texts: Iterable[str]) -> None:
+    """ValueError for text with a code that no character has, which NumPy reads from a damaged file."""
+    for text in texts:
+        if any(ord(character) > sys.maxunicode for character in text):
+            raise ValueError("text with codes that no character has")
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:

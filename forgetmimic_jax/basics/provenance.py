@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
+import itertools
 import os
 import platform
 import re
 import subprocess
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import PackageNotFoundError, entry_points, version
 from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parents[1]
@@ -114,6 +115,24 @@ def cores() -> int:
     """How many cores this process may use; `PYTHON_CPU_COUNT` sets it, as Python itself does from 3.13 on."""
     given = os.environ.get("PYTHON_CPU_COUNT", "")
     return int(given) if given.isdigit() and int(given) else _schedulable()
+
+
+def gpus() -> list[str]:
+    """The NVIDIA GPUs that JAX would take here, as CUDA_VISIBLE_DEVICES names them; JAX does not start for it."""
+    wanted = os.environ.get("JAX_PLATFORMS", "").split(",")[0]
+    if wanted not in ("", "cuda", "gpu") or not any(
+        "cuda" in plugin.name for plugin in entry_points(group="jax_plugins")
+    ):
+        return []
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if visible is not None:  # CUDA ignores what follows a name that no GPU has
+        names = [name.strip() for name in visible.split(",")]
+        return list(itertools.takewhile(lambda name: name not in ("", "-1", "NoDevFiles"), names))
+    try:
+        found = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, timeout=30).stdout
+    except (OSError, subprocess.TimeoutExpired):
+        return []
+    return [str(number) for number in range(len(re.findall(r"^GPU \d+:", found, re.MULTILINE)))]
 
 
 def _schedulable() -> int:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import collections
 import io
 import math
-import pickle
 import re
 import zipfile
 from collections.abc import Mapping
@@ -20,7 +19,7 @@ import numpy as np
 import yaml
 
 from forgetmimic_jax.basics.errors import InputError
-from forgetmimic_jax.basics.files import check_no_pointer
+from forgetmimic_jax.basics.files import check_no_pointer, readable
 from forgetmimic_jax.exchange.imported import UNKNOWN_COUNT, ImportedActor
 from forgetmimic_jax.motion.unpickle import NumbersOnly, Refused
 
@@ -205,20 +204,16 @@ def read_tensors(path: Path) -> dict[str, Any]:
     Raises:
         InputError: not such a file, a damaged one, or a pickle that would call anything else.
     """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            names = [name for name in archive.namelist() if name.endswith("/data.pkl")]
-            if len(names) != 1:
-                raise InputError(f"{path}: no data.pkl in it; accepted: a file of torch.save")
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    with readable(path, "file of torch.save, torch 1.6 or later"), zipfile.ZipFile(path) as archive:
+        names = [name for name in archive.namelist() if name.endswith("/data.pkl")]
+        if len(names) != 1:
+            raise InputError(f"{path}: no data.pkl in it; accepted: a file of torch.save")
+        try:
             content = _Tensors(archive, names[0].removesuffix("data.pkl")).load()
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except zipfile.BadZipFile:
-        raise InputError(f"{path}: not a file of torch.save (torch 1.6 or later)") from None
-    except Refused as error:
-        raise InputError(f"{path}: refused: the pickle would call {error}; accepted: tensors and numbers") from None
-    except (pickle.UnpicklingError, KeyError, ValueError, TypeError, EOFError, AttributeError, IndexError) as error:
-        raise InputError(f"{path}: damaged: {type(error).__name__}: {error}") from None
+        except Refused as error:
+            raise InputError(f"{path}: refused: the pickle would call {error}; accepted: tensors and numbers") from None
     if not isinstance(content, dict):
         raise InputError(f"{path}: found a {type(content).__name__}; accepted: the dict that rsl_rl saves")
     return content

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.lib import format as npy
 
 from forgetmimic_jax.basics.errors import InputError
+from forgetmimic_jax.basics.files import check_characters, readable
 from forgetmimic_jax.motion.recording import Recording, needed, rate_of, shaped
 from forgetmimic_jax.motion.unpickle import unpickled
 from forgetmimic_jax.robot.model import Robot
@@ -65,19 +66,18 @@ def read_fields(path: Path) -> dict[str, Any]:
         InputError: no NPZ, or a field that would run code.
     """
     content: dict[str, Any] = {}
-    try:
-        with zipfile.ZipFile(path) as archive:
-            for member in archive.namelist():
-                with archive.open(member) as file:
-                    version = npy.read_magic(file)
-                    header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-                    if header(file)[2].hasobject:
-                        content[member.removesuffix(".npy")] = unpickled(file, path)
-                        continue
-                    file.seek(0)
-                    content[member.removesuffix(".npy")] = npy.read_array(file, allow_pickle=False)
-    except (ValueError, zipfile.BadZipFile, EOFError, OSError) as error:
-        raise InputError(f"{path}: not a readable NPZ ({error})") from None
+    with readable(path, "NPZ"), zipfile.ZipFile(path) as archive:
+        for member in archive.namelist():
+            with archive.open(member) as file:
+                version = npy.read_magic(file)
+                header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+                if header(file)[2].hasobject:
+                    content[member.removesuffix(".npy")] = unpickled(file, path)
+                    continue
+                file.seek(0)
+                content[member.removesuffix(".npy")] = array = npy.read_array(file, allow_pickle=False)
+                if array.dtype.kind == "U":
+                    check_characters(array.reshape(-1).tolist())
     return content
 
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import io
 import re
-import zipfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from forgetmimic_jax.basics.errors import InputError
-from forgetmimic_jax.basics.files import write_atomically
+from forgetmimic_jax.basics.files import check_characters, readable, write_atomically
+from forgetmimic_jax.motion.recording import numbers
 
 DIMENSIONS = {"fps": 0, "joint_names": 1, "root_pos": 2, "root_quat": 2, "joint_pos": 2}  # of each field's array
 FIELDS = tuple(DIMENSIONS)
@@ -77,7 +77,8 @@ def validated(clip: Clip, source: str, first: int = 0) -> Clip:
             )
     if frames < 2:
         raise InputError(f"{source}: found {frames} frame(s); a clip needs at least 2")
-    norm = np.linalg.norm(clip.root_quat, axis=-1)
+    with np.errstate(over="ignore"):  # of numbers that no quaternion has; the next line refuses them
+        norm = np.linalg.norm(clip.root_quat, axis=-1)
     if (np.abs(norm - 1.0) > 0.05).any():
         frame = int(np.argmax(np.abs(norm - 1.0)))
         raise InputError(
@@ -127,14 +128,13 @@ def read_clip(path: Path) -> Clip:
     Raises:
         InputError: not an NPZ, a missing field, or numbers that are no motion.
     """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            missing = [field for field in FIELDS if field not in archive]
-            if missing:
-                raise InputError(f"{path}: missing {', '.join(missing)}; a clip holds {', '.join(FIELDS)}")
-            content = {field: np.asarray(archive[field]) for field in FIELDS}
-    except (ValueError, zipfile.BadZipFile, EOFError) as error:
-        raise InputError(f"{path}: not a clip NPZ ({error})") from error
+    with readable(path, "clip NPZ"), np.load(path, allow_pickle=False) as archive:
+        missing = [field for field in FIELDS if field not in archive]
+        if missing:
+            raise InputError(f"{path}: missing {', '.join(missing)}; a clip holds {', '.join(FIELDS)}")
+        content = {field: np.asarray(archive[field]) for field in FIELDS}
+        if content["joint_names"].dtype.kind == "U":
+            check_characters(content["joint_names"].reshape(-1).tolist())
     for field, value in content.items():
         accepted = "U" if field == "joint_names" else "iuf"
         if value.dtype.kind not in accepted or value.ndim != DIMENSIONS[field]:
@@ -147,9 +147,9 @@ def read_clip(path: Path) -> Clip:
             name=path.stem,
             fps=float(content["fps"]),
             joint_names=tuple(str(joint) for joint in content["joint_names"]),
-            root_pos=content["root_pos"].astype(np.float64),
-            root_quat=content["root_quat"].astype(np.float64),
-            joint_pos=content["joint_pos"].astype(np.float64),
+            root_pos=numbers(content["root_pos"], "root_pos", path),
+            root_quat=numbers(content["root_quat"], "root_quat", path),
+            joint_pos=numbers(content["joint_pos"], "joint_pos", path),
         ),
         str(path),
     )

@@ -85,7 +85,8 @@ def trimmed(recording: Recording, reading: Reading, rate: float, path: Path) -> 
 def numbers(value: Any, field: str, path: Path) -> np.ndarray:
     """The value as float64; InputError where it holds anything else."""
     try:
-        return np.asarray(value, np.float64)
+        with np.errstate(invalid="ignore", over="ignore"):  # a damaged file's numbers; who reads them refuses NaN
+            return np.asarray(value, np.float64)
     except (TypeError, ValueError):
         raise InputError(f"{path}: {field}: found a {type(value).__name__}; numbers are needed") from None
 

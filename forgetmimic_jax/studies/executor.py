@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import functools
+import queue
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -18,7 +18,8 @@ from typing import Any, NamedTuple
 
 from forgetmimic_jax.basics.console import closing
 from forgetmimic_jax.basics.errors import InputError, Interrupted
-from forgetmimic_jax.basics.provenance import cores, provenance
+from forgetmimic_jax.basics.provenance import cores, gpus, provenance
+from forgetmimic_jax.settings.options import at_least
 from forgetmimic_jax.studies.board import board
 from forgetmimic_jax.studies.task import Task, run_task, stop_tasks
 
@@ -36,6 +37,21 @@ class Place(NamedTuple):
     stop: Callable[[Sequence[Path]], object]
 
 
+def at_a_time(jobs: int | None, cluster: str | None, few: int = 1) -> int:
+    """How many tasks run at a time on this machine: `--jobs`, or else one on each GPU; `few` where there is none.
+
+    Raises:
+        InputError: fewer than one, or more than there are GPUs.
+    """
+    there = 0 if cluster else len(gpus())
+    if jobs is None:
+        return there or few
+    at_least(1, "--jobs", jobs)
+    if there and jobs > there:
+        raise InputError(f"--jobs: found {jobs}; accepted: 1 to {there}, since each takes one of the GPUs")
+    return jobs
+
+
 def run_tasks(tasks: Sequence[Task], *, jobs: int, cluster: str | None = None, description: str) -> dict[Task, str]:
     """Run the tasks that are not finished; returns those that failed, each with its reason.
 
@@ -44,7 +60,8 @@ def run_tasks(tasks: Sequence[Task], *, jobs: int, cluster: str | None = None, d
 
     Args:
         tasks: one that is given twice runs once.
-        jobs: tasks at a time on this machine. Each has as many threads as this process has cores, divided by `jobs`.
+        jobs: tasks at a time on this machine. Each has as many threads as this process has cores, divided by `jobs`,
+            and where there are GPUs, one of them for itself.
         cluster: address of a dask scheduler, such as tcp://host:8786; then its workers run the tasks, one at a time
             each, with the worker's own number of threads.
         description: of the table.
@@ -97,8 +114,19 @@ def on_this_machine(jobs: int) -> Iterator[Place]:
 
     Of the standard library's executors, that of processes would lose all of its tasks where one process is killed.
     """
+    threads, free, there = max(1, cores() // jobs), queue.SimpleQueue[str](), gpus()
+    for gpu in there:
+        free.put(gpu)
+
+    def run(task: Task, directory: Path, code: str) -> str | None:
+        gpu = free.get() if there else None
+        try:
+            return run_task(task, directory, code, threads, gpu=gpu)
+        finally:
+            if gpu is not None:
+                free.put(gpu)
+
     with ThreadPoolExecutor(jobs) as executor:
-        run = functools.partial(run_task, threads=max(1, cores() // jobs))
         yield Place(executor, run, stop_tasks)
 
 

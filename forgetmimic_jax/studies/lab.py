@@ -47,11 +47,12 @@ class Lab:
             known: what the JSON of studies says of trials, by the trial's name (`known_trials`).
             fresh: the study trains fresh policies, so that its unit is the seed, however many bases there are.
         """
+        from forgetmimic_jax.studies.executor import at_a_time
         from forgetmimic_jax.studies.policies import find_bases, find_controls
         from forgetmimic_jax.tracking.setup import check_targets, default_targets
 
-        for flag in ("episodes", "jobs"):
-            at_least(1, f"--{flag}", getattr(options, flag))
+        self.jobs = at_a_time(options.jobs, options.cluster, few=2)
+        at_least(1, "--episodes", options.episodes)
         at_least(1, "--iterations", iterations)
         self.options, self.iterations = options, iterations
         self.bases = find_bases(options)
@@ -161,7 +162,7 @@ class Lab:
         from forgetmimic_jax.studies.trials import run_trials
 
         missing = [trial for trial in trials.values() if self._finished(trial) is None]
-        jobs, cluster = self.options.jobs, self.options.cluster
+        jobs, cluster = self.jobs, self.options.cluster
         failed = run_trials(missing, jobs=jobs, cluster=cluster, description=what) if missing else {}
         self.failed |= {trial.folder.name: reason for trial, reason in failed.items()}
         finished = self._folders(trials)

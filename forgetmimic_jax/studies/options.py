@@ -33,8 +33,8 @@ class Options:
     intervals are then, and 3 with one base, whose seeds they are over."""
     episodes: int = 20
     """Evaluation episodes a clip."""
-    jobs: int = 2
-    """Trials at a time on this machine; they share its cores evenly. With a GPU: 1."""
+    jobs: int | None = None
+    """Trials at a time on this machine; they share its cores evenly; one on each GPU by default, 2 without a GPU."""
     cluster: str | None = None
     """Address of a dask scheduler, such as tcp://host:8786, whose workers run the trials; see docs/cluster.md."""
     trials: Path = Path("runs/trials")

@@ -13,7 +13,7 @@ import shutil
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from forgetmimic_jax.basics.files import read_rows, write_atomically
 from forgetmimic_jax.basics.provenance import PACKAGE, provenance
 from forgetmimic_jax.studies.process import CODE
 
+PROC = Path("/proc")  # of Linux: what the kernel says of processes
 ATTEMPTS = 3  # at a task whose process the system kills
 POLL = 1.0  # s between two questions whether a running task is still wanted
 # Environment variables that say how many threads to use: to `provenance.cores`, to XLA, and to BLAS.
@@ -65,7 +66,7 @@ class Task:
 
     @property
     def mark(self) -> Path:
-        """While a worker runs the task: a file with the worker's host and process."""
+        """While a worker runs the task: a file with the worker's host, process and the process's start."""
         return self.folder.with_name(f"{self.folder.name}.running")
 
     @property
@@ -76,7 +77,12 @@ class Task:
 
 
 def run_task(
-    task: Task, directory: Path, code: str, threads: int, wanted: Callable[[], bool] = lambda: True
+    task: Task,
+    directory: Path,
+    code: str,
+    threads: int,
+    wanted: Callable[[], bool] = lambda: True,
+    gpu: str | None = None,
 ) -> str | None:
     """Run a task here, from its newest checkpoint if it has one.
 
@@ -88,6 +94,7 @@ def run_task(
         code: `code_hash` of the program that wants it.
         threads: that the command may use.
         wanted: whether anyone still waits for the task; if not, it is stopped.
+        gpu: the only one that the command sees, as CUDA_VISIBLE_DEVICES names it; by default those of this process.
 
     Returns:
         None where the task is finished now, otherwise why it is not.
@@ -98,7 +105,7 @@ def run_task(
         with _marked(task):
             _here[task.folder] = None
             try:
-                return _attempts(task, directory, threads, wanted)
+                return _attempts(task, directory, _environment(threads, gpu), wanted)
             finally:
                 _here.pop(task.folder, None)
     except InputError as error:
@@ -133,19 +140,36 @@ def _marked(task: Task) -> Iterator[None]:
     Raises:
         InputError: another process of this machine runs the task.
     """
-    mine = f"{platform.node()} {os.getpid()}"
+    mine = f"{platform.node()} {os.getpid()} {_start_of(os.getpid())}"
     try:
         with task.mark.open("x") as file:
             file.write(mine)
     except FileExistsError:
-        host, _, process = task.mark.read_text().partition(" ")
-        if host == platform.node() and process.isdigit() and _is_alive(int(process)):
+        if (process := _at_work(task.mark.read_text())) is not None:
             raise InputError(f"process {process} runs it") from None
         write_atomically(task.mark, mine.encode())
     try:
         yield
     finally:
         task.mark.unlink(missing_ok=True)
+
+
+def _at_work(mark: str) -> int | None:
+    """The process of a mark, if it still runs on this machine; its number alone may be another process's by now."""
+    host, process, start = (*mark.split(), "", "", "")[:3]
+    if host != platform.node() or not process.isdigit() or not _is_alive(int(process)):
+        return None
+    return int(process) if _start_of(int(process)) in ("", start) else None
+
+
+def _start_of(process: int) -> str:
+    """When a process started: the boot's identity and clock ticks since then; empty where the system does not say."""
+    try:
+        boot = (PROC / "sys/kernel/random/boot_id").read_text().strip()
+        fields = (PROC / str(process) / "stat").read_text().rpartition(")")[2].split()  # from the third on
+    except OSError:
+        return ""
+    return f"{boot}:{fields[19]}"
 
 
 def _is_alive(process: int) -> bool:
@@ -158,9 +182,9 @@ def _is_alive(process: int) -> bool:
     return True
 
 
-def _attempts(task: Task, directory: Path, threads: int, wanted: Callable[[], bool]) -> str | None:
+def _attempts(task: Task, directory: Path, more: Mapping[str, str], wanted: Callable[[], bool]) -> str | None:
     for _ in range(ATTEMPTS):
-        process = _start(task, directory, threads)
+        process = _start(task, directory, more)
         code = _end(task, process, wanted) if process else 0
         if task.finished:
             return None
@@ -181,8 +205,8 @@ def _end(task: Task, process: subprocess.Popen, wanted: Callable[[], bool]) -> i
                 stop_tasks([task.folder])
 
 
-def _start(task: Task, directory: Path, threads: int) -> subprocess.Popen | None:
-    """The task's process; None if the task was stopped before."""
+def _start(task: Task, directory: Path, more: Mapping[str, str]) -> subprocess.Popen | None:
+    """The task's process, with more environment variables; None if the task was stopped before."""
     from forgetmimic_jax.training.checkpoint import newest_checkpoint
 
     command = [sys.executable, "-m", "forgetmimic_jax.studies.process", task.command, *task.flags]
@@ -199,7 +223,7 @@ def _start(task: Task, directory: Path, threads: int) -> subprocess.Popen | None
         process = subprocess.Popen(
             command,
             cwd=directory,
-            env=os.environ | _environment(threads),
+            env={**os.environ, **more},
             stdin=subprocess.PIPE,
             stdout=log,
             stderr=subprocess.STDOUT,
@@ -209,11 +233,11 @@ def _start(task: Task, directory: Path, threads: int) -> subprocess.Popen | None
     return process
 
 
-def _environment(threads: int) -> dict[str, str]:
-    """For the process of a task: where the code of this process lies, its hash, and how many threads it may use."""
+def _environment(threads: int, gpu: str | None) -> dict[str, str]:
+    """For the process of a task: where the code of this process lies, its hash, its threads and its GPU."""
     paths = [str(PACKAGE.parent), *filter(None, [os.environ.get("PYTHONPATH")])]
     counts = dict.fromkeys(THREADS, str(threads))
-    counts[CODE] = provenance().code
+    counts |= {CODE: provenance().code} | ({} if gpu is None else {"CUDA_VISIBLE_DEVICES": gpu})
     return counts | {"PYTHONPATH": os.pathsep.join(paths), "PYTHONSAFEPATH": "1"}
 
 

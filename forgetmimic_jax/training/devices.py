@@ -11,10 +11,12 @@ import atexit
 import contextlib
 import dataclasses
 import os
+import re
 import shutil
+import sys
 import tempfile
 from pathlib import Path
-from typing import TypeVar
+from typing import NoReturn, TypeVar
 
 import jax
 import numpy as np
@@ -37,6 +39,8 @@ T = TypeVar("T")
 # are, and which one this is, from 0.
 ADDRESS, PROCESSES, PROCESS = "JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID"
 LAUNCHERS = ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")  # srun and mpirun set how many they started
+
+_copies: list[Path] = []  # folders of `own_folder`, which this process removes at its end
 
 
 def join(config: Config) -> None:
@@ -106,12 +110,30 @@ def own_folder(directory: Path) -> Path:
     if jax.process_index() > 0:
         temporary = Path(tempfile.mkdtemp(prefix="forgetmimic-"))
         atexit.register(shutil.rmtree, temporary, ignore_errors=True)
+        _copies.append(temporary)
         own = temporary / directory.name
         for name in (directory.name, f"{directory.name}-{STAND}"):
             if directory.with_name(name).is_dir():
                 shutil.copytree(directory.with_name(name), temporary / name)
     multihost_utils.sync_global_devices("folders")
     return own
+
+
+def is_of_xla(error: BaseException) -> bool:
+    """Whether XLA failed, as it does where it waits for a process that has ended; JAX raises ValueError for some."""
+    status = re.match(r"[A-Z_]+: ", str(error))
+    return status is not None and isinstance(error, jax.errors.JaxRuntimeError | ValueError)
+
+
+def leave(message: str) -> NoReturn:
+    """End this process with one line and exit code 1.
+
+    Only where another process may have ended: at a normal end JAX waits for it, in vain, and then aborts.
+    """
+    print(message, file=sys.stderr, flush=True)
+    for copy in _copies:
+        shutil.rmtree(copy, ignore_errors=True)
+    os._exit(1)
 
 
 def mesh_of(devices: int) -> Mesh | None:

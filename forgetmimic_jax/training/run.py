@@ -24,7 +24,17 @@ from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.training import checkpoint
 from forgetmimic_jax.training.checkpoint import Progress, checkpoints, newest_checkpoint
 from forgetmimic_jax.training.course import MakeCourse, Plain, Position
-from forgetmimic_jax.training.devices import anywhere, gathered, local, mesh_of, shard_environment, share, spread
+from forgetmimic_jax.training.devices import (
+    anywhere,
+    gathered,
+    is_of_xla,
+    leave,
+    local,
+    mesh_of,
+    shard_environment,
+    share,
+    spread,
+)
 from forgetmimic_jax.training.folder import prepare_folder
 from forgetmimic_jax.training.log import Log
 from forgetmimic_jax.training.start import another_machine, saved_state, start_state, steps_before, unlearned_base
@@ -122,6 +132,9 @@ def run(
             shutil.rmtree(directory, ignore_errors=True)  # nothing in it to continue with
         elif isinstance(error, KeyboardInterrupt):
             raise interrupted(config, directory, course.command) from None
+        elif jax.process_count() > 1 and is_of_xla(error):
+            why = str(error).partition("\n")[0]
+            leave(f"error: {why}; if another process has ended, start all of them again with --resume")
         elif isinstance(error, OSError) and error.filename is None:
             error.filename = str(directory)  # a full disk does not say where
         raise

@@ -108,3 +108,30 @@ def test_an_accelerator_stands_before_the_processor(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(jax, "devices", lambda: [SimpleNamespace(device_kind="Abacus")])
     assert made_here() == dataclasses.replace(provenance(), processor=f"Abacus, {provenance().processor}")
+
+
+@pytest.mark.parametrize(
+    ("plugin", "environment", "expected"),
+    [
+        ("xla_cuda12", {}, ["0", "1"]),
+        ("xla_cuda12", {"JAX_PLATFORMS": "cuda,cpu", "CUDA_VISIBLE_DEVICES": "3, GPU-7"}, ["3", "GPU-7"]),
+        ("xla_cuda12", {"CUDA_VISIBLE_DEVICES": "3,-1,4"}, ["3"]),
+        ("xla_cuda12", {"CUDA_VISIBLE_DEVICES": ""}, []),
+        ("xla_cuda12", {"JAX_PLATFORMS": "cpu"}, []),
+        ("xla_cuda12", {"PATH": ""}, []),  # no nvidia-smi
+        ("another", {}, []),
+    ],
+)
+def test_the_gpus_that_jax_would_take(tmp_path, monkeypatch, plugin, environment, expected):
+    tool = tmp_path / "nvidia-smi"
+    tool.write_text(
+        "#!/bin/sh\necho 'GPU 0: A (UUID: GPU-1)'\necho '  MIG 1g Device 0: (UUID: MIG-2)'\necho 'GPU 1: A'\n"
+    )
+    tool.chmod(0o755)
+    monkeypatch.setattr(module, "entry_points", lambda group: [SimpleNamespace(name=plugin)])
+    for name in ("JAX_PLATFORMS", "CUDA_VISIBLE_DEVICES"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    assert module.gpus() == expected

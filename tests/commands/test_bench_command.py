@@ -1,4 +1,5 @@
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -39,6 +40,19 @@ def test_memory_is_computed_without_a_simulation(tiny, monkeypatch, tmp_path, li
     # The rollout alone: 4 steps of 8 environments with two observations of 132 and more than 600 numbers.
     assert figures["temporary_gib"] * 2**30 > 4 * 8 * (132 + 600) * 4
     assert figures["together_gib"] > figures["arguments_gib"] > figures["state_gib"] > 0.0
+
+
+@pytest.mark.parametrize(
+    ("preset", "physics", "engine"), [("cpu", None, "native"), ("paper", None, "mjx"), ("paper", "native", "native")]
+)
+def test_the_memory_of_the_preset_of_a_gpu_is_that_of_its_engine(
+    tiny, monkeypatch, library_folder, preset, physics, engine
+):
+    monkeypatch.setattr(speed, "memory", lambda setup: {"engine": setup.config.physics.engine})
+    options = bench.Options(library=library_folder, dry=True, preset=preset, physics=physics)
+    printed = finished(bench.main, options).printed
+    assert re.search(rf"engine │ +{engine} │", printed)
+    assert ("--physics: mjx, the engine of this preset on a GPU" in printed) == (engine == "mjx")
 
 
 def test_a_comparison_is_the_ratio_of_medians_over_processes_in_turn(monkeypatch):

@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 from miniature import TINY, Run, finished, load_state, started
 from trees import assert_same, leaves
+from waiting import until
 
 from forgetmimic_jax import pretrain, train, unlearn
 from forgetmimic_jax.ppo.collect import collect
@@ -243,6 +244,19 @@ def test_two_processes_end_together_where_the_first_ones_targets_are_at_the_base
     address = f"127.0.0.1:{free_port()}"
     both = [python("-c", ENDS, runs.one.folder / "config.yaml", address, number) for number in range(2)]
     assert [printed(process).splitlines()[-1] for process in both] == ["the last iteration is 70"] * 2
+
+
+def test_a_process_whose_other_one_is_killed_ends_in_one_line(library_folder, tmp_path):
+    together = {"JAX_COORDINATOR_ADDRESS": f"127.0.0.1:{free_port()}", "JAX_NUM_PROCESSES": 2, "PYTHON_CPU_COUNT": 1}
+    given = ["--devices", 2, "--library", library_folder, "--iterations", 10**6, "--set", *SETTINGS]
+    first, second = (process(tmp_path / "run", *given, **together, JAX_PROCESS_ID=number) for number in range(2))
+    until(lambda: int((newest_checkpoint(tmp_path / "run") or Path("0")).name) > 0 or first.poll() is not None)
+    second.kill()
+    second.communicate()
+    _, error = first.communicate(timeout=600)
+    assert (first.returncode, error.count("\n")) == (1, 1), error
+    assert error.startswith("error: ")
+    assert error.endswith("; if another process has ended, start all of them again with --resume\n")
 
 
 COMMANDS = [(train.main, train.Options), (pretrain.main, pretrain.Options), (unlearn.main, unlearn.Options)]

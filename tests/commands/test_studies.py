@@ -362,7 +362,7 @@ def test_help_lists_what_a_study_takes(capsys):
             command()
         assert exit_.value.code == 0
         text = capsys.readouterr().out
-        for flag in ("--preset {cpu,paper}", "--mix-commits", "--seeds {None}|INT", "--jobs INT", "--draw"):
+        for flag in ("--preset {cpu,paper}", "--mix-commits", "--seeds {None}|INT", "--jobs {None}|INT", "--draw"):
             assert flag in text
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from damaged import ARCHIVES
 
 from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.exchange import rsl_rl
@@ -131,7 +132,7 @@ def test_tensors_are_what_their_strides_show(tmp_path, shown, expected):
 
 @pytest.mark.parametrize("shown", [(0, (7,), (1,)), (5, (2,), (1,)), (-1, (2,), (1,)), (0, (10**12,), (0,))])
 def test_a_tensor_beyond_its_storage_is_refused(tmp_path, shown):
-    with pytest.raises(InputError, match=r"damaged: ValueError: a tensor of \[.* in a storage of 6$"):
+    with pytest.raises(InputError, match=r"not a readable file of .*ValueError: a tensor of \[.* in a storage of 6\)$"):
         read_tensors(tensor_file(tmp_path / "m.pt", shown, STORAGE))
 
 
@@ -180,16 +181,25 @@ def test_what_is_no_such_checkpoint_is_refused(tmp_path):
     assert message(tmp_path / "nowhere.pt") == "no such file"
     old = tmp_path / "old.pt"
     old.write_bytes(b"\x80\x02\x8a\nl\xfc\x9cF")
-    assert message(old) == "not a file of torch.save (torch 1.6 or later)"
+    assert message(old).startswith("not a readable file of torch.save, torch 1.6 or later (BadZipFile: ")
     pointer = tmp_path / "pointer.pt"
     pointer.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n")
     assert message(pointer) == "this is a Git LFS pointer, not the file: run git lfs pull"
     assert message(saved(tmp_path / "list.pt", [1])) == "found a list; accepted: the dict that rsl_rl saves"
     assert message(saved(tmp_path / "other.pt", {"iter": 3})).startswith("found iter; accepted: actor_state_dict or ")
-    assert message(saved(tmp_path / "half.pt", pickle.dumps({"iter": 3})[:-3])).startswith("damaged: ")
+    assert message(saved(tmp_path / "half.pt", pickle.dumps({"iter": 3})[:-3])).startswith(
+        "not a readable file of torch.save"
+    )
     recurrent = {"model_state_dict": {"memory_a.rnn.weight_ih_l0": np.zeros((4, 4))}}
     assert message(saved(tmp_path / "r.pt", recurrent)).startswith("found memory_a.rnn.weight_ih_l0; accepted: an MLP")
     assert message(saved(tmp_path / "none.pt", {"actor_state_dict": {}})).startswith("no mlp.0.weight in it; ")
     normed = {"mlp.0.weight": np.zeros((8, 132)), "mlp.0.bias": np.zeros(8), "mlp.1.weight": np.zeros(8)}
     message_of_norm = message(saved(tmp_path / "norm.pt", {"actor_state_dict": normed}))
     assert message_of_norm.startswith("mlp.1.weight: found shape [8] as module 1; accepted: linear layers with an ")
+
+
+@pytest.mark.parametrize("damage", ARCHIVES)
+def test_a_damaged_archive_is_one_line(copy, damage):
+    copy.write_bytes(damage(copy))
+    with pytest.raises(InputError, match=rf"^{copy}: not a readable file of torch\.save.*\([^\n]*\)$"):
+        read_tensors(copy)

@@ -9,6 +9,7 @@ import zipfile
 import jax
 import numpy as np
 import pytest
+from damaged import ARCHIVES, ARRAYS
 from motion_cases import waving
 
 from forgetmimic_jax.basics.errors import InputError
@@ -240,3 +241,28 @@ def test_a_member_that_is_no_array_is_named(folder):
             archive.writestr(name, b"not an array" if name == "joint_pos.npy" else content)
     with pytest.raises(InputError, match=r"sway\.npz: joint_pos: found bytes96 of shape \[\]"):
         read_clip(folder / "sway.npz")
+
+
+@pytest.mark.parametrize("damage", ARCHIVES + ARRAYS)
+def test_a_clip_that_is_damaged_is_one_line(folder, damage):
+    (folder / "sway.npz").write_bytes(damage(folder / "sway.npz"))
+    with pytest.raises(InputError, match=rf"^{folder / 'sway.npz'}: not a readable clip NPZ \([^\n]*\)$"):
+        read_clip(folder / "sway.npz")
+
+
+@pytest.mark.parametrize(
+    ("field", "code", "expected"),
+    [
+        ("joint_names", 0x7FFFFFFF, "not a readable clip NPZ"),
+        ("root_quat", 0x7F800001, "root_quat: NaN or infinity"),  # a signalling NaN
+        ("root_quat", 0x7F000000, "root_quat: norm 1.7e"),
+    ],
+)
+def test_values_that_cannot_be_are_refused_without_a_warning(folder, recwarn, field, code, expected):
+    with np.load(folder / "sway.npz") as archive:
+        content = dict(archive)
+    content[field].view(np.uint32).reshape(-1)[0] = code
+    np.savez(folder / "sway.npz", **content)
+    with pytest.raises(InputError, match=expected):
+        read_clip(folder / "sway.npz")
+    assert not recwarn.list

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from damaged import ARCHIVES, ARRAYS
 from motion_files import write_pickle
 from orders import isaac_order
 
@@ -220,6 +221,30 @@ def test_an_npz_that_is_no_motion(robot, tmp_path):
     assert "joint_names" in message(robot, with_changes(**doubled, joint_pos=np.zeros((40, 30))))
     path.write_bytes(b"not a zip")
     assert "NPZ" in message(robot, path)
+
+
+@pytest.mark.parametrize("damage", ARCHIVES + ARRAYS)
+def test_an_npz_that_is_damaged(robot, tmp_path, damage):
+    path = tmp_path / "a.npz"
+    np.savez(path, **npz_fields(robot))
+    path.write_bytes(damage(path))
+    assert f"{path}: not a readable NPZ (" in message(robot, path)
+
+
+def test_names_that_are_no_characters(robot, tmp_path):
+    names = np.array(robot.joint_names)
+    names.view(np.uint32)[3] = 0x7FFFFFFF
+    np.savez(tmp_path / "a.npz", **{**npz_fields(robot), "joint_names": names})
+    assert "not a readable NPZ" in message(robot, tmp_path / "a.npz")
+
+
+def test_numbers_that_cannot_be_cast_are_refused_without_a_warning(robot, tmp_path, recwarn):
+    fields = npz_fields(robot)
+    angles = fields["joint_pos"].astype(np.float32)
+    angles.view(np.uint32)[0, 0] = 0x7F800001  # a signalling NaN
+    np.savez(tmp_path / "a.npz", **{**fields, "joint_pos": angles})
+    assert "NaN" in message(robot, tmp_path / "a.npz")
+    assert not recwarn.list
 
 
 def test_a_pickle_that_is_no_motion(robot, tmp_path):

@@ -1,6 +1,7 @@
 """Tasks on this machine. The process here is a few lines that write what a run writes, so that only the care counts."""
 
 import contextlib
+import itertools
 import os
 import re
 import signal
@@ -18,7 +19,7 @@ from waiting import until
 from forgetmimic_jax.basics.errors import InputError, Interrupted
 from forgetmimic_jax.basics.provenance import cores, provenance
 from forgetmimic_jax.studies import executor, task
-from forgetmimic_jax.studies.executor import RESOURCE, on_cluster, run_tasks, run_together
+from forgetmimic_jax.studies.executor import RESOURCE, at_a_time, on_cluster, run_tasks, run_together
 from forgetmimic_jax.studies.process import CODE
 from forgetmimic_jax.studies.task import ATTEMPTS, Task, run_task
 
@@ -45,10 +46,15 @@ if flag["--seed"] == "6" or flag["--seed"] == "7" and "--resume" not in sys.argv
     os.kill(os.getpid(), signal.SIGKILL)
 if flag["--seed"] == "5":
     (folder / "threads").write_text(" ".join(os.environ[name] for name in ("PYTHON_CPU_COUNT", "NPROC")))
+if flag["--seed"] in "23":
+    (folder / "gpu").write_text(os.environ.get("CUDA_VISIBLE_DEVICES", "all"))
 time.sleep(60 if flag["--seed"] == "9" else 0.2)
 (folder / flag.get("--last", "evaluation.json")).write_text("{{}}")
 note("end")
 """
+
+
+START = task._start_of(os.getpid())
 
 
 @pytest.fixture(autouse=True)
@@ -58,6 +64,7 @@ def quick(tmp_path, monkeypatch):
     script.chmod(0o755)
     monkeypatch.setattr(task.sys, "executable", str(script))
     monkeypatch.setattr(executor, "POLL", 0.02)
+    monkeypatch.setattr(executor, "gpus", list)
 
 
 def a_task(tmp_path: Path, seed: int) -> Task:
@@ -141,6 +148,28 @@ def test_a_task_has_its_share_of_the_cores(tmp_path, monkeypatch):
         (wanted.folder / "evaluation.json").unlink()
 
 
+@pytest.mark.parametrize(("there", "seen"), [([], {"all"}), (["4", "GPU-7"], {"4", "GPU-7"}), (["4"], {"4"})])
+def test_every_task_has_a_gpu_for_itself(tmp_path, monkeypatch, there, seen):
+    monkeypatch.setattr(executor, "gpus", lambda: there)
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    wanted = [a_task(tmp_path, seed) for seed in (2, 3)]
+    for _ in range(2):  # a GPU is free again after its task
+        run_tasks(wanted, jobs=2, description="try")
+        assert {(one.folder / "gpu").read_text() for one in wanted} == seen
+        for one in wanted:
+            (one.folder / "evaluation.json").unlink()
+    most = max(itertools.accumulate(1 if line.startswith("start") else -1 for line in journal(tmp_path)))
+    assert most == (len(there) or 2)
+
+
+def test_by_default_one_task_runs_on_each_gpu_and_more_are_refused(monkeypatch):
+    assert (at_a_time(None, None), at_a_time(None, None, few=2), at_a_time(3, None)) == (1, 2, 3)
+    monkeypatch.setattr(executor, "gpus", lambda: ["4", "5"])
+    assert (at_a_time(None, None), at_a_time(2, None), at_a_time(3, "tcp://a:8786")) == (2, 2, 3)
+    with pytest.raises(InputError, match=r"^--jobs: found 3; accepted: 1 to 2, since each takes one of the GPUs$"):
+        at_a_time(3, None)
+
+
 def test_a_task_that_is_given_twice_runs_once(tmp_path):
     run_tasks([a_task(tmp_path, 2), a_task(tmp_path, 2)], jobs=2, description="try")
     assert journal(tmp_path) == ["start 2", "end 2"]
@@ -176,14 +205,36 @@ def test_a_process_that_is_killed_each_time_fails(tmp_path):
     assert journal(tmp_path) == ["start 6", *["start 6+"] * (ATTEMPTS - 1)]
 
 
-def test_a_task_at_which_another_process_works_is_left_to_it(tmp_path):
+@pytest.mark.parametrize("system", ["Linux", "macOS"])
+def test_a_task_at_which_another_process_works_is_left_to_it(tmp_path, monkeypatch, system):
+    if system == "macOS":
+        monkeypatch.setattr(task, "PROC", tmp_path / "none")
     wanted = [a_task(tmp_path, seed) for seed in (2, 3)]
     wanted[0].mark.parent.mkdir(parents=True)
-    mark = f"{task.platform.node()} {os.getppid()}"
+    mark = f"{task.platform.node()} {os.getppid()} {task._start_of(os.getppid())}"
     wanted[0].mark.write_text(mark)
     assert run_tasks(wanted, jobs=1, description="try") == {wanted[0]: f"process {os.getppid()} runs it"}
     assert journal(tmp_path) == ["start 3", "end 3"]
     assert wanted[0].mark.read_text() == mark
+
+
+def test_a_process_does_not_take_a_task_twice(tmp_path):
+    wanted = a_task(tmp_path, 2)
+    wanted.mark.parent.mkdir(parents=True)
+    with task._marked(wanted):
+        assert run_tasks([wanted], jobs=1, description="try") == {wanted: f"process {os.getpid()} runs it"}
+    assert run_tasks([wanted], jobs=1, description="try") == {}
+
+
+@pytest.mark.skipif(not START, reason="the system does not say when a process started")
+@pytest.mark.parametrize("process", [os.getpid, os.getppid])
+@pytest.mark.parametrize("start", ["", f"{START}0", f"0{START}"], ids=["unknown", "another", "another boot"])
+def test_the_mark_of_a_process_that_had_the_number_before_is_replaced(tmp_path, process, start):
+    wanted = a_task(tmp_path, 2)
+    wanted.mark.parent.mkdir(parents=True)
+    wanted.mark.write_text(f"{task.platform.node()} {process()} {start}")
+    assert run_tasks([wanted], jobs=1, description="try") == {}
+    assert not wanted.mark.exists()
 
 
 @pytest.mark.parametrize("mark", ["", "gone", f"{task.platform.node()} 4194304", "another-host 1"])
