@@ -215,7 +215,7 @@ def test_numbers_of_other_code_that_answer_the_question_stay_and_say_so(by_other
 def test_rows_of_other_code_are_not_added_to(by_other_code, base_run, refused, monkeypatch):
     monkeypatch.setattr(trials, "run_trials", None)
     message = refused(sweep.main, options(sweep.Options, base_run, by_other_code, kind="seeds", seeds=3))
-    assert "seeds.json: made by code 0123abcd (commit fffffff), and this is code " in message
+    assert "seeds.json: made by code 0123abcd (commit fffffff) with JAX " in message
     assert message.endswith("--mix-commits puts their runs into one table, another --output keeps them apart")
 
 

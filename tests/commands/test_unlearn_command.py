@@ -15,6 +15,7 @@ from forgetmimic_jax.basics.errors import InputError, Interrupted, run_command
 from forgetmimic_jax.basics.files import read_rows
 from forgetmimic_jax.basics.provenance import provenance
 from forgetmimic_jax.evaluation import evaluate as evaluation
+from forgetmimic_jax.evaluation import metrics
 from forgetmimic_jax.evaluation.metrics import Rollout
 from forgetmimic_jax.motion.library import DATA_DIR, read_manifest
 from forgetmimic_jax.settings.config import load_config, validate
@@ -448,6 +449,7 @@ def test_a_run_with_a_stop_rule_ends_early_and_after_a_kill_with_the_same_bits(o
     """Looks at 2 and 4 find the targets at a baseline of any skill; two iterations later the run ends."""
     monkeypatch.setattr(stopping, "AT_BASELINE", np.inf)
     monkeypatch.setattr(stopping, "SETTLE", 2)
+    monkeypatch.setattr(metrics, "MINIMUM_SKILL_RANGE", -np.inf)  # this base hardly beats the zero action
     whole = tmp_path / "whole"
     unlearn.main(options(output=whole, iterations=9, episodes=1, set=[["unlearn.stop_every=2"]]))
     assert [path.name for path in sorted((whole / "checkpoints").iterdir())] == ["00000004", "00000006"]
