@@ -36,7 +36,7 @@ STARTS: dict[str, Any] = {
     "bin_seconds": 0.3,
     "uniform_ratio": 0.1,
     "smoothing": 0.05,
-    "first_frame": 0.3,
+    "first_frame": 0.5,
 }
 
 
