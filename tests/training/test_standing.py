@@ -70,7 +70,7 @@ def test_a_base_that_falls_more_often_learns_it_from_the_targets_states(setup, e
     assert (config.iterations, config.sampling.target_share, config.ppo.base_kl) == (7, 1.0, 0.0)
     starts = config.sampling  # most of them where it fails
     assert (starts.rule, starts.bin_seconds, starts.uniform_ratio) == ("adaptive", 0.3, 0.1)
-    assert (starts.smoothing, starts.first_frame) == (0.05, 0.3)
+    assert (starts.smoothing, starts.first_frame) == (0.05, 0.5)
     assert (config.ppo.learning_rate, config.max_episode_steps) == (3e-4, 100)  # the teacher's own
     assert config.unlearn == setup.config.unlearn
     assert started["setup"].library is setup.library
