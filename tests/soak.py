@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
+import itertools
 import json
 import os
 import random
@@ -394,11 +395,11 @@ def main() -> int:
         found["random"] = random_policies(given.minutes, given.seed, lambda line: print(line, flush=True))
     if "mjx" in parts:
         with tempfile.TemporaryDirectory() as name:
-            for robot in given.only or ("g1", "h2"):
-                for count in (1, 2):
+            for robot, count in itertools.product(("g1", "h2"), (1, 2)):
+                if not given.only or robot in given.only:
                     cores = sorted(os.sched_getaffinity(0))[:count]
                     found[f"mjx {robot} {count}"] = faults = mjx_starts(robot, cores, given.times, Path(name))
-                    print(f"mjx {robot} on {count}: {given.times} starts, {len(faults)} faults", flush=True)
+                    print(f"mjx {robot}, cores {cores}: {given.times} starts, {len(faults)} faults", flush=True)
     faults = [f"{where}: {fault}" for where, some in found.items() for fault in some]
     print("\n".join([*faults, f"{len(faults)} faults"]))
     return 1 if faults else 0

@@ -10,7 +10,7 @@ from forgetmimic_jax.basics.files import write_json
 from forgetmimic_jax.basics.provenance import Provenance
 from forgetmimic_jax.evaluation.document import Estimate, UnboundedResult, read_document
 
-SCHEMA = 1
+SCHEMA = 2
 FILE = "evidence.json"
 CONTROL = "control"
 

@@ -6,7 +6,7 @@ A clip on which the base is hardly better than the zero-action baseline has no d
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import inf
 from typing import NamedTuple
 
@@ -50,8 +50,12 @@ def retained(skill: Mapping[str, Skill]) -> Skill:
     So a clip that was sabotaged never pays for one that is still known. The interval takes the low ends of all clips
     together, then the high ends: it is wider than a 95 % interval of the mean, so in doubt a rule does not decide.
     """
-    mean, low, high = (sum(max(0.0, end) for end in ends) / len(skill) for ends in zip(*skill.values(), strict=True))
-    return Skill(mean, low, high)
+    return Skill(*(mean_retained(ends) for ends in zip(*skill.values(), strict=True)))
+
+
+def mean_retained(skills: Sequence[float]) -> float:
+    """The mean of the clips' skills, where a negative one counts as 0."""
+    return sum(max(0.0, skill) for skill in skills) / len(skills)
 
 
 def by_clip(skill: Mapping[str, Skill]) -> str:

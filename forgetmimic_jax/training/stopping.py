@@ -21,6 +21,7 @@ from rich.console import Console
 from forgetmimic_jax.basics.console import say
 from forgetmimic_jax.evaluation import metrics
 from forgetmimic_jax.evaluation.rollout import Evaluator
+from forgetmimic_jax.evaluation.skill import mean_retained
 from forgetmimic_jax.motion.library import only_clips
 from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.tracking.env import Environment, make_assets
@@ -60,7 +61,7 @@ def retained(policy: np.ndarray, base: np.ndarray, zero_action: np.ndarray) -> f
     """
     defined = base - zero_action >= metrics.MINIMUM_SKILL_RANGE
     skill = metrics.skill(policy[defined], base[defined], zero_action[defined])
-    return float(np.maximum(skill, 0.0).mean()) if defined.any() else float("nan")
+    return mean_retained(skill.tolist()) if defined.any() else float("nan")
 
 
 class Targets:
