@@ -22,6 +22,8 @@ from forgetmimic_jax.training.run import run
 
 EPISODES = 20  # a target
 ENOUGH = 0.95  # upright rate of a base that needs no training
+TAUGHT = 0.92  # upright rate after the training; below it the training goes on
+LONGER = 1.5  # times the iterations, at most
 # PPO; the reference of a target clip is the stand, and only a fall terminates an episode.
 STANDING = Rule(runs_on=HOLD_SECONDS, replace_reference=True)
 # The teacher needs no clip any more, so it has no KL to the base.
@@ -54,8 +56,8 @@ def standing_teacher(setup: Setup, directory: Path) -> Policy:
     """The base, if it stays upright with the stand as its reference; else the base after training on that.
 
     The training is PPO from the base. Its episodes start in the target clips, their reference is the stand, and only a
-    fall terminates them. Its folder is `directory` with `-stand` at the end. One that is there already
-    continues.
+    fall terminates them. It goes on for half as many iterations where the policy still falls too often. Its folder is
+    `directory` with `-stand` at the end. One that is there already continues.
 
     Raises:
         InputError: the folder is of a run with other settings.
@@ -68,29 +70,38 @@ def standing_teacher(setup: Setup, directory: Path) -> Policy:
         say(said)
         return setup.base
     say(f"{said}; it learns to stand first")
-    learning = _learning(setup)
+    iterations = round(setup.config.unlearn.settings["stand_iterations"])
+    learning, longer = _learning(setup, iterations), _learning(setup, round(LONGER * iterations))
     folder = directory.with_name(f"{directory.name}-{STAND}")
     resume = newest_checkpoint(folder) is not None
-    devices = learning.config.devices  # another number of them continues too
-    if resume and dataclasses.replace(load_config(folder / CONFIG), devices=devices) != learning.config:
-        raise InputError(f"{folder}: is of a run with other settings; remove it, or choose another --output")
+    if resume:
+        devices = learning.config.devices  # another number of them continues too
+        found = dataclasses.replace(load_config(folder / CONFIG), devices=devices)
+        if found not in (learning.config, longer.config):
+            raise InputError(f"{folder}: is of a run with other settings; remove it, or choose another --output")
+        learning = longer if found == longer.config else learning
     try:
         _, state = run(learning, folder, description="learn to stand", resume=resume, rule=STANDING)
+        upright = upright_rate(setup, state.policy)
+        if upright < TAUGHT and learning is not longer:
+            say(f"it stays upright in {upright:.0%} now; it goes on for half as many iterations")
+            _, state = run(longer, folder, description="learn to stand", resume=True, rule=STANDING)
+            upright = upright_rate(setup, state.policy)
     except Interrupted:
         text = f"stopped while the base learned to stand; saved {folder}; the same command continues"
         raise Interrupted(text) from None
-    say(f"after training it stays upright in {upright_rate(setup, state.policy):.0%}")
+    say(f"after training it stays upright in {upright:.0%}")
     return state.policy
 
 
-def _learning(setup: Setup) -> Setup:
+def _learning(setup: Setup, iterations: int) -> Setup:
     """The setup of the training: all starts are in the targets, more of them where it fails."""
     config = setup.config
     return dataclasses.replace(
         setup,
         config=dataclasses.replace(
             config,
-            iterations=round(config.unlearn.settings["stand_iterations"]),
+            iterations=iterations,
             ppo=dataclasses.replace(config.ppo, **LEARNING),
             sampling=dataclasses.replace(config.sampling, **STARTS),
             max_episode_steps=min(config.max_episode_steps, round(SECONDS / config.physics.control_step)),

@@ -483,7 +483,8 @@ def test_a_base_that_cannot_stand_learns_that_first_and_then_teaches(options, tm
         r"the base stays upright in \d+% of the targets' episodes; it learns to stand first$", printed, re.M
     )
     assert re.search(r"^after training it stays upright in \d+%$", printed, re.M)
-    learned = checkpoint.read_info(tmp_path / "run-stand" / "checkpoints" / "00000002")
+    assert "; it goes on for half as many iterations\n" in printed
+    learned = checkpoint.read_info(tmp_path / "run-stand" / "checkpoints" / "00000003")
     assert (learned.config.sampling.target_share, learned.config.unlearn.method) == (1.0, "stand")
     starts = learned.config.sampling
     assert (starts.rule, starts.bin_seconds) == ("adaptive", 0.3)  # its bins are not the base's
@@ -502,7 +503,7 @@ def test_a_base_that_cannot_stand_learns_that_first_and_then_teaches(options, tm
 
     shutil.rmtree(tmp_path / "run")
     with pytest.raises(InputError, match=r"run-stand: is of a run with other settings; remove it, or choose another"):
-        unlearn.main(stand(3))
+        unlearn.main(stand(4))
 
 
 @pytest.mark.parametrize(("reached", "warned"), [(39, True), (40, False)])
