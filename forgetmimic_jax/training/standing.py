@@ -40,6 +40,7 @@ STARTS: dict[str, Any] = {
     "smoothing": 0.05,
     "first_frame": 0.5,
 }
+LATER = {"first_frame": 0.2}  # of the iterations beyond the first: by then the first frames are learned
 
 
 def upright_rate(setup: Setup, policy: Policy) -> float:
@@ -71,7 +72,7 @@ def standing_teacher(setup: Setup, directory: Path) -> Policy:
         return setup.base
     say(f"{said}; it learns to stand first")
     iterations = round(setup.config.unlearn.settings["stand_iterations"])
-    learning, longer = _learning(setup, iterations), _learning(setup, round(LONGER * iterations))
+    learning, longer = _learning(setup, iterations), _learning(setup, round(LONGER * iterations), **LATER)
     folder = directory.with_name(f"{directory.name}-{STAND}")
     resume = newest_checkpoint(folder) is not None
     if resume:
@@ -94,7 +95,7 @@ def standing_teacher(setup: Setup, directory: Path) -> Policy:
     return state.policy
 
 
-def _learning(setup: Setup, iterations: int) -> Setup:
+def _learning(setup: Setup, iterations: int, **starts: float) -> Setup:
     """The setup of the training: all starts are in the targets, more of them where it fails."""
     config = setup.config
     return dataclasses.replace(
@@ -103,7 +104,7 @@ def _learning(setup: Setup, iterations: int) -> Setup:
             config,
             iterations=iterations,
             ppo=dataclasses.replace(config.ppo, **LEARNING),
-            sampling=dataclasses.replace(config.sampling, **STARTS),
+            sampling=dataclasses.replace(config.sampling, **STARTS | starts),
             max_episode_steps=min(config.max_episode_steps, round(SECONDS / config.physics.control_step)),
         ),
     )

@@ -92,6 +92,7 @@ def test_one_that_still_falls_learns_for_half_as_long_again(setup, evaluated, ru
     assert standing_teacher(setup, tmp_path / "run") == "taught by 2"
     assert [(of.config.iterations, resume) for of, _, resume, _ in runs] == [(6, False), (9, True)]
     assert runs[0][1] == runs[1][1]  # the second continues the first
+    assert [of.config.sampling.first_frame for of, *_ in runs] == [0.5, 0.2]
     said = capsys.readouterr().out.splitlines()
     assert said[-2:] == [
         "it stays upright in 85% now; it goes on for half as many iterations",
