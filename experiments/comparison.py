@@ -16,7 +16,7 @@ from forgetmimic_jax.studies.lab import Lab
 from forgetmimic_jax.studies.policies import retrained_in_words
 from forgetmimic_jax.studies.study import Document, Study
 from forgetmimic_jax.studies.variants import TRACKING, difference, mean_gained, paired, variant_bars, variant_table
-from forgetmimic_jax.training.standing import LONGER
+from forgetmimic_jax.training.standing import longest
 from forgetmimic_jax.unlearning import distill, stand
 from forgetmimic_jax.unlearning.method import SHORT
 
@@ -31,7 +31,7 @@ def plain(method: str) -> str:
     return f"{method.replace('_', ' ')}, plain PPO"
 
 
-STAND_TEACHER = round(LONGER * stand.METHOD.settings["stand_iterations"])  # at most, and before the run's own
+STAND_TEACHER = longest(stand.METHOD.settings["stand_iterations"])  # at most, and before the run's own
 STAND = f"stand (and up to {STAND_TEACHER} for its teacher)"
 METHODS: dict[str, dict[str, Any]] = {
     "fine-tuned, kept clips": {"method": "finetune"},

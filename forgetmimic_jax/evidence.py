@@ -147,17 +147,25 @@ def _unlearned(run: Path) -> tuple[Path, CheckpointInfo]:
 
 def _several(options: Options, runs: Sequence[Path]) -> None:
     """The evidence on each run, in a process of its own."""
-    from forgetmimic_jax.attacks.document import FILE
+    from forgetmimic_jax.attacks.document import FILE, read_evidence
+    from forgetmimic_jax.attacks.judged import FILE as JUDGED
     from forgetmimic_jax.basics.console import command_line
     from forgetmimic_jax.studies.executor import at_a_time, run_together
     from forgetmimic_jax.studies.task import Task
 
-    jobs = at_a_time(options.jobs, options.cluster)
-    tasks = []
+    jobs, scale = at_a_time(options.jobs, options.cluster), _scale(options)
+    tasks, last = [], JUDGED if options.fakes else FILE
     for run in runs:
         _unlearned(run)
+        if (run / FILE).is_file():
+            found = read_evidence(run / FILE)
+            if (found.episodes, found.seeds) != (scale.episodes, scale.seeds):
+                raise InputError(
+                    f"{run / FILE}: of {found.episodes} episodes a clip and {found.seeds} training(s) of each kind; "
+                    f"accepted: {scale.episodes} and {scale.seeds}; attack this run alone, or remove the file"
+                )
         flags = flags_of(dataclasses.replace(options, run=str(run), jobs=None, cluster=None))
-        tasks.append(Task(run, "evidence", flags, iterations=0, last=FILE, adds=True))
+        tasks.append(Task(run, "evidence", flags, iterations=0, last=last, adds=True))
     following = command_line("report", run=runs[0])
     run_together(tasks, following, description="evidence", jobs=jobs, cluster=options.cluster)
 

@@ -112,21 +112,28 @@ def main(options: Options) -> None:
 def _several(options: Options, output: Path) -> None:
     """A training of each seed, in a process of its own."""
     from forgetmimic_jax.basics.console import command_line
+    from forgetmimic_jax.basics.provenance import gpus
     from forgetmimic_jax.studies.executor import at_a_time, run_together
     from forgetmimic_jax.studies.task import Task
-    from forgetmimic_jax.training.folder import check_writable
+    from forgetmimic_jax.training.folder import check_writable, config_there
 
     assert options.seeds is not None
     at_least(1, "--seeds", options.seeds)
     jobs = at_a_time(options.jobs, options.cluster)
     if options.resume:
         raise InputError("--resume: found with --seeds; leave it out: the same command continues what was stopped")
+    if (options.devices or 1) > 1 and not options.cluster and gpus():
+        raise InputError(
+            f"--devices: found {options.devices} with --seeds; accepted: 1, since each training has one GPU"
+        )
     check_writable(output)
     alone = dataclasses.replace(options, seeds=None, jobs=None, cluster=None, output=None)
     first, tasks = options.seed or 0, []
     for seed in range(first, first + options.seeds):
         one, folder = dataclasses.replace(alone, seed=seed), output.with_name(f"{output.name}-{seed}")
         config = config_of(one, folder)
+        if folder.is_dir() and any(folder.iterdir()):
+            config_there(folder, config)
         if config.base and options.base:
             one = dataclasses.replace(one, base=Path(config.base))  # the checkpoint that a run's folder stands for
         tasks.append(Task(folder, "pretrain", flags_of(one), config.iterations))

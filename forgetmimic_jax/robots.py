@@ -12,6 +12,7 @@ import tyro
 
 from forgetmimic_jax.basics.console import closing, command_line, warn
 from forgetmimic_jax.basics.errors import InputError, run_command
+from forgetmimic_jax.basics.files import write_atomically
 from forgetmimic_jax.settings.options import parse
 
 if TYPE_CHECKING:
@@ -93,7 +94,7 @@ def check_mjcf(options: Check) -> None:
     except Unreadable as error:
         raise InputError(f"{options.file}: {error}") from None
     folder.mkdir(parents=True, exist_ok=True)
-    file.write_text(yaml_of(proposal, options.file.resolve()))
+    write_atomically(file, yaml_of(proposal, options.file.resolve()).encode())
     draw_roles(model, proposal.roles, folder / f"{name}.png")
     print("\n".join(f"mended: {note}" for note in proposal.notes))
     missing = proposal.missing
@@ -102,7 +103,7 @@ def check_mjcf(options: Check) -> None:
             print(_try(file))
         except InputError as error:
             missing = [line.removeprefix(f"{file.resolve()}: ") for line in str(error).splitlines()]
-            file.write_text(yaml_of(replace(proposal, missing=missing), options.file.resolve()))
+            write_atomically(file, yaml_of(replace(proposal, missing=missing), options.file.resolve()).encode())
     print("\n".join(f"missing: {line}" for line in missing))
     for line in proposal.doubts:
         warn(line)

@@ -201,6 +201,17 @@ def _robot(folder: Path) -> tuple[list[Path], Callable[[], object]]:
     return files, lambda: load_robot("g1", robots_dir=folder)
 
 
+def _vendor(folder: Path) -> tuple[list[Path], Callable[[], object]]:
+    """A vendor's MJCF, of which `robot check` makes a robot."""
+    path = Path(shutil.copyfile(SHARED / "robots" / "unitree_h1_raw.xml", folder / "vendor.xml"))
+
+    def check() -> None:
+        with contextlib.chdir(folder):  # it writes runs/ there
+            robots.check_mjcf(robots.Check(path, force=True))
+
+    return [path], check
+
+
 def _config(folder: Path) -> tuple[list[Path], Callable[[], object]]:
     shutil.copyfile(base_folder("g1") / "config.yaml", folder / "config.yaml")
     return [folder / "config.yaml"], lambda: load_config(folder / "config.yaml")
@@ -266,6 +277,7 @@ FAMILIES: dict[str, Family] = {
     "pickle": lambda folder: _motion(folder, "yanjie_walk_001_gmr.pkl"),
     "library": _library,
     "robot": _robot,
+    "vendor": _vendor,
     "config": _config,
     "checkpoint": _checkpoint,
     "run": _run_part,
@@ -273,7 +285,7 @@ FAMILIES: dict[str, Family] = {
     "pt": _pt,
     "deploy": lambda folder: _policy(folder, "unitree_rl_lab_dance_102/policy.onnx"),
 }
-OF_OTHERS = ("npz", "compressed", "pickle", "onnx", "deploy")  # families of files in SHARED
+OF_OTHERS = ("npz", "compressed", "pickle", "vendor", "onnx", "deploy")  # families of files in SHARED
 
 
 def flags(rng: random.Random) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import mujoco
@@ -13,18 +14,23 @@ from forgetmimic_jax.robot.model import Robot
 MAX_TILT = 30.0  # degrees
 MAX_DROP = 0.15  # of the default height
 MAX_ERROR = 0.8  # rad
+SECONDS = 1.0
+# MuJoCo finds these where a simulation diverges. Then it starts again at time 0.
+DIVERGED = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
 
 
 @dataclass(frozen=True)
 class Held:
     """Where a robot is after a second of holding its default pose."""
 
-    tilt: float  # degrees of the root from upright
+    tilt: float  # degrees of the root from upright; it and the next two are NaN where the simulation diverges
     drop: float  # m of the root
     error: float  # rad, the joint furthest from its target
     stands: bool
 
     def __str__(self) -> str:
+        if math.isnan(self.tilt):
+            return "the simulation diverges; masses, inertias, places of bodies or gains may be wrong"
         return (
             f"root tilted by {self.tilt:.0f} degrees, {self.drop:.3f} m lower, joints at most {self.error:.2f} rad off"
         )
@@ -36,8 +42,11 @@ def hold(robot: Robot) -> Held:
     joint_target = np.asarray(robot.arrays.default_joint_pos, np.float64)
     data.qpos[:7], data.qpos[7:] = [0.0, 0.0, robot.default_height, 1.0, 0.0, 0.0, 0.0], joint_target
     data.ctrl[:] = joint_target
-    while data.time < 1.0:
+    mujoco.set_mju_user_warning(lambda message: None)  # else it writes a file where the command runs
+    for _ in range(math.ceil(SECONDS / model.opt.timestep)):
         mujoco.mj_step(model, data)
+        if any(data.warning[warning].number for warning in DIVERGED):
+            return Held(math.nan, math.nan, math.nan, stands=False)
     upright = float(np.clip(data.xmat[1].reshape(3, 3)[2, 2], -1.0, 1.0))
     tilt, drop = float(np.degrees(np.arccos(upright))), robot.default_height - float(data.qpos[2])
     error = float(np.abs(data.qpos[7:] - joint_target).max())

@@ -208,6 +208,7 @@ def _end(task: Task, process: subprocess.Popen, wanted: Callable[[], bool]) -> i
 def _start(task: Task, directory: Path, more: Mapping[str, str]) -> subprocess.Popen | None:
     """The task's process, with more environment variables; None if the task was stopped before."""
     from forgetmimic_jax.training.checkpoint import newest_checkpoint
+    from forgetmimic_jax.training.devices import without_others
 
     command = [sys.executable, "-m", "forgetmimic_jax.studies.process", task.command, *task.flags]
     if not task.adds:
@@ -223,7 +224,7 @@ def _start(task: Task, directory: Path, more: Mapping[str, str]) -> subprocess.P
         process = subprocess.Popen(
             command,
             cwd=directory,
-            env={**os.environ, **more},
+            env={**without_others(os.environ), **more},
             stdin=subprocess.PIPE,
             stdout=log,
             stderr=subprocess.STDOUT,

@@ -305,6 +305,11 @@ def load_failure_level(path: Path, bins: Bins) -> Array:
     return jnp.asarray(level)
 
 
+def is_whole(info: CheckpointInfo) -> bool:
+    """Whether a checkpoint has the whole state, so that a run can be resumed from it."""
+    return (info.path / RUN).is_dir()
+
+
 def load_state(info: CheckpointInfo, template: TrainState) -> TrainState:
     """The whole TrainState of a resumable checkpoint; `template` gives the shapes (`jax.eval_shape` of `init_state`).
 
@@ -312,7 +317,7 @@ def load_state(info: CheckpointInfo, template: TrainState) -> TrainState:
         InputError: the checkpoint has no `run/`, is damaged, or is of other shapes.
     """
     folder = info.path / RUN
-    if not folder.is_dir():
+    if not is_whole(info):
         raise InputError(f"{info.path}: no {RUN}/ to resume from; start a new run with --base {info.path}")
     _check_files(info, f"{RUN}/")
     abstract = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), _run_part(template))

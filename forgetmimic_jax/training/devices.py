@@ -15,6 +15,7 @@ import re
 import shutil
 import sys
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NoReturn, TypeVar
 
@@ -53,12 +54,13 @@ def join(config: Config) -> None:
             processes cannot share.
     """
     validate(config)
-    devices = config.devices
+    devices, processes = config.devices, _processes()
+    if devices % processes:
+        raise InputError(
+            f"--devices: found {devices}; accepted: a multiple of {processes}, the processes that were started together"
+        )
     if devices == 1:
         return
-    processes = _processes()
-    if devices % processes:
-        raise InputError(f"--devices: found {devices}; accepted: a multiple of the {processes} processes")
     here = devices // processes
     # XLA's pool needs a thread for each device's program, which waits there for the others, and more for the work.
     os.environ["NPROC"] = str(cores() + here)
@@ -97,6 +99,11 @@ def _number(name: str) -> int:
     if not found.isdigit():
         raise InputError(f"{name}: found '{found}'; accepted: a whole number, beside {ADDRESS}")
     return int(found)
+
+
+def without_others(environment: Mapping[str, str]) -> dict[str, str]:
+    """Environment variables for a process that runs on its own, whatever started this one."""
+    return {name: value for name, value in environment.items() if name not in (ADDRESS, PROCESSES, PROCESS, *LAUNCHERS)}
 
 
 def own_folder(directory: Path) -> Path:

@@ -9,11 +9,13 @@ best/               with evaluations during training: the policy that did best o
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import shutil
 from pathlib import Path
 
 from forgetmimic_jax.basics.errors import InputError
+from forgetmimic_jax.settings.config import Config, load_config
 from forgetmimic_jax.training.checkpoint import BEST as BEST
 from forgetmimic_jax.training.checkpoint import newest_checkpoint
 
@@ -59,6 +61,25 @@ def prepare_folder(directory: Path, *, resume: bool) -> Path | None:
         other = "continue with --resume" if newest_checkpoint(directory) else "remove it"
         raise InputError(f"{directory}: exists already; choose another --output, or {other}")
     return None
+
+
+def config_there(directory: Path, *accepted: Config) -> Config:
+    """The settings of the run in a folder that the same command continues, on any number of devices.
+
+    Args:
+        directory: of the run.
+        accepted: settings that it may have.
+
+    Raises:
+        InputError: it has others, or the folder is of no run.
+    """
+    file = directory / "config.yaml"
+    if not file.is_file():
+        raise InputError(f"{directory}: exists already, and is of no run; remove it, or choose another --output")
+    found = dataclasses.replace(load_config(file), devices=accepted[0].devices)
+    if found not in accepted:
+        raise InputError(f"{directory}: is of a run with other settings; remove it, or choose another --output")
+    return found
 
 
 def _has_nothing(directory: Path) -> bool:

@@ -7,17 +7,17 @@ from pathlib import Path
 from typing import Any
 
 from forgetmimic_jax.basics.console import say
-from forgetmimic_jax.basics.errors import InputError, Interrupted
+from forgetmimic_jax.basics.errors import Interrupted
 from forgetmimic_jax.evaluation.metrics import HOLD_SECONDS
 from forgetmimic_jax.evaluation.rollout import Evaluator
 from forgetmimic_jax.motion.library import only_clips
 from forgetmimic_jax.policy.policy import Policy
 from forgetmimic_jax.ppo.rule import Rule
-from forgetmimic_jax.settings.config import load_config
 from forgetmimic_jax.tracking.setup import Setup
 from forgetmimic_jax.tracking.stand import STAND
-from forgetmimic_jax.training.checkpoint import CONFIG, newest_checkpoint
+from forgetmimic_jax.training.checkpoint import newest_checkpoint
 from forgetmimic_jax.training.devices import agreed
+from forgetmimic_jax.training.folder import config_there
 from forgetmimic_jax.training.run import run
 
 EPISODES = 20  # a target
@@ -41,6 +41,11 @@ STARTS: dict[str, Any] = {
     "first_frame": 0.5,
 }
 LATER = {"first_frame": 0.2}  # of the iterations beyond the first: by then the first frames are learned
+
+
+def longest(iterations: float) -> int:
+    """The most iterations of a training that is asked for `iterations`."""
+    return round(LONGER * iterations)
 
 
 def upright_rate(setup: Setup, policy: Policy) -> float:
@@ -72,14 +77,11 @@ def standing_teacher(setup: Setup, directory: Path) -> Policy:
         return setup.base
     say(f"{said}; it learns to stand first")
     iterations = round(setup.config.unlearn.settings["stand_iterations"])
-    learning, longer = _learning(setup, iterations), _learning(setup, round(LONGER * iterations), **LATER)
+    learning, longer = _learning(setup, iterations), _learning(setup, longest(iterations), **LATER)
     folder = directory.with_name(f"{directory.name}-{STAND}")
     resume = newest_checkpoint(folder) is not None
     if resume:
-        devices = learning.config.devices  # another number of them continues too
-        found = dataclasses.replace(load_config(folder / CONFIG), devices=devices)
-        if found not in (learning.config, longer.config):
-            raise InputError(f"{folder}: is of a run with other settings; remove it, or choose another --output")
+        found = config_there(folder, learning.config, longer.config)
         learning = longer if found == longer.config else learning
     try:
         _, state = run(learning, folder, description="learn to stand", resume=resume, rule=STANDING)

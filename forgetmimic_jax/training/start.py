@@ -126,9 +126,17 @@ def template(env: Environment, assets: Assets) -> TrainState:
 
 
 def saved_state(setup: Setup, env: Environment, assets: Assets, path: Path) -> tuple[TrainState, int]:
-    """The state of a checkpoint of this run, and the environment steps behind it."""
+    """The state of a checkpoint of this run, and the environment steps behind it.
+
+    What another process than the first wrote has no state. There a fresh one stands for it until the run begins: then
+    every process has the first one's (`devices.spread`).
+    """
     info = checkpoint.read_info(path)
     checkpoint.check_matches(info, setup, resume=True)
+    if jax.process_index() > 0 and not checkpoint.is_whole(info):
+        state = start_state(setup, env, assets)
+        state = dataclasses.replace(state, iteration=jnp.full_like(state.iteration, info.iteration))
+        return state, info.environment_steps
     state = checkpoint.load_state(info, template(env, assets))
     step_size = setup.config.ppo.learning_rate
     if step_size != info.config.ppo.learning_rate:  # changed with --set; else the state's own holds

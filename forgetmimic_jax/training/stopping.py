@@ -32,8 +32,8 @@ from forgetmimic_jax.training.devices import agreed
 
 AT_BASELINE = 0.1  # skill up to which the targets are at the zero-action baseline
 IN_A_ROW = 2
-SETTLE = 60  # iterations
-KEEP = 4.0  # factor on the weight of the KL to the base while a run settles, so that the kept clips recover
+SETTLE = 100  # iterations
+KEEP = 6.0  # factor on the weight of the KL to the base while a run settles, so that the kept clips recover
 EPISODES = 10  # a target clip
 
 

@@ -20,7 +20,7 @@ from waiting import until
 from forgetmimic_jax import pretrain, sweep
 from forgetmimic_jax.basics.provenance import cores
 from forgetmimic_jax.evaluation.document import read_evaluation
-from forgetmimic_jax.settings.config import load_config
+from forgetmimic_jax.settings.config import load_config, save_config
 from forgetmimic_jax.settings.options import parse
 from forgetmimic_jax.studies import executor, trials
 from forgetmimic_jax.studies.executor import RESOURCE
@@ -130,6 +130,20 @@ def test_every_seed_of_a_pretraining_is_a_task(submitted, library_folder, tmp_pa
     for seed, task in zip((4, 5), found.tasks, strict=True):
         assert parse(pretrain.Options, "pretrain", task.flags) == dataclasses.replace(one, seed=seed)
         assert (task.command, task.iterations, task.adds) == ("pretrain", 400, False)
+
+
+def test_a_seed_whose_folder_is_of_another_run_is_refused(refused, library_folder, tmp_path):
+    folder = tmp_path / "base-5"
+    folder.mkdir()
+    (folder / "evaluation.json").write_text("{}")
+    options = pretrain.Options(library=library_folder, iterations=400, seed=4, seeds=2, output=Path("base"))
+    assert refused(pretrain.main, options) == (
+        "base-5: exists already, and is of no run; remove it, or choose another --output"
+    )
+    save_config(pretrain.config_of(dataclasses.replace(options, seed=5), folder), folder / "config.yaml")
+    assert refused(pretrain.main, dataclasses.replace(options, iterations=500)) == (
+        "base-5: is of a run with other settings; remove it, or choose another --output"
+    )
 
 
 def test_every_trial_of_a_sweep_is_a_task(submitted, base_run, tmp_path):

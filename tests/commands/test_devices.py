@@ -23,6 +23,7 @@ from trees import assert_same, leaves
 from waiting import until
 
 from forgetmimic_jax import pretrain, train, unlearn
+from forgetmimic_jax.basics.errors import InputError
 from forgetmimic_jax.ppo.collect import collect
 from forgetmimic_jax.ppo.log import rollout_metrics
 from forgetmimic_jax.ppo.state import TrainState
@@ -32,6 +33,7 @@ from forgetmimic_jax.tracking.env import make_assets, make_environment
 from forgetmimic_jax.tracking.setup import Setup, make_setup
 from forgetmimic_jax.training import run as run_module
 from forgetmimic_jax.training.checkpoint import newest_checkpoint
+from forgetmimic_jax.training.start import saved_state
 from forgetmimic_jax.unlearning.registry import method_of
 
 ITERATIONS = 2
@@ -187,6 +189,20 @@ def test_one_of_two_processes_prints_and_the_other_leaves_no_file(runs):
     assert [list(folder.iterdir()) for folder in runs.temporary] == [[], []]
 
 
+def test_a_process_without_the_state_takes_what_it_can_and_the_rest_from_the_first(runs, setup, tmp_path, monkeypatch):
+    """As in METHOD=stand, whose teacher continues in the processes that have just trained it."""
+    of_another = Path(shutil.copytree(runs.one.checkpoint(ITERATIONS), tmp_path / "checkpoint"))
+    shutil.rmtree(of_another / "run")
+    env, assets = make_environment(setup, ENVS), make_assets(setup)
+    with pytest.raises(InputError, match="no run/ to resume from"):
+        saved_state(setup, env, assets, of_another)
+    monkeypatch.setattr(jax, "process_index", lambda: 1)
+    found, steps = saved_state(setup, env, assets, of_another)
+    first, of_the_first = saved_state(setup, env, assets, runs.one.checkpoint(ITERATIONS))
+    assert (int(found.iteration), steps) == (ITERATIONS, of_the_first)
+    assert jax.tree.map(jnp.shape, found) == jax.tree.map(jnp.shape, first)
+
+
 def test_every_shard_draws_its_own_noise_and_keeps_its_branches(setup, references):
     state = started(setup)
     noise = []
@@ -233,7 +249,7 @@ unlearn = UnlearnConfig(("turn",), settings={"penalty": 16.0}, stop_every=5)
 setup = make_setup(dataclasses.replace(load_config(Path(settings)), evaluate_every=0, unlearn=unlearn))
 course = stopping.Stopping(setup, None, Path("."), Console(), None)
 position = course.begin(Position(SimpleNamespace(policy=None), make_assets(setup), 0, 0))
-while not course.finished and position.iteration < 100:
+while not course.finished and position.iteration < 200:
     position = course.after(dataclasses.replace(position, iteration=position.iteration + 1))
 print("the last iteration is", position.iteration)
 """
@@ -243,7 +259,7 @@ def test_two_processes_end_together_where_the_first_ones_targets_are_at_the_base
     """The second process measures a skill of 1 throughout; alone it would never end."""
     address = f"127.0.0.1:{free_port()}"
     both = [python("-c", ENDS, runs.one.folder / "config.yaml", address, number) for number in range(2)]
-    assert [printed(process).splitlines()[-1] for process in both] == ["the last iteration is 70"] * 2
+    assert [printed(process).splitlines()[-1] for process in both] == ["the last iteration is 110"] * 2
 
 
 def test_a_process_whose_other_one_is_killed_ends_in_one_line(library_folder, tmp_path):
@@ -281,7 +297,9 @@ def test_processes_that_do_not_fit_are_refused(refused, library_folder, monkeypa
         "JAX_NUM_PROCESSES: found ''; accepted: a whole number, beside JAX_COORDINATOR_ADDRESS"
     )
     monkeypatch.setenv("JAX_NUM_PROCESSES", "3")
-    assert refused(train.main, options) == "--devices: found 4; accepted: a multiple of the 3 processes"
+    together = "accepted: a multiple of 3, the processes that were started together"
+    assert refused(train.main, options) == f"--devices: found 4; {together}"
+    assert refused(train.main, dataclasses.replace(options, devices=None)) == f"--devices: found 1; {together}"
 
 
 def test_a_gradient_step_needs_a_step_of_every_device(refused, library_folder):

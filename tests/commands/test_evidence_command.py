@@ -218,6 +218,8 @@ def test_a_run_of_other_targets_beside_is_refused(run, base_run, tmp_path):
 
 def test_every_run_to_attack_is_a_task(run, tmp_path, monkeypatch):
     runs, where = [shutil.copytree(run, tmp_path / name) for name in ("a", "b")], {"jobs": 3, "cluster": "tcp://a:8786"}
+    for folder in runs:
+        (folder / "evidence.json").unlink(missing_ok=True)
     given = []
     monkeypatch.setattr(executor, "run_tasks", lambda tasks, **how: given.append((tasks, how)) or {})
     one = evidence.Options(run="a", full=True, recovery_iterations=7)
@@ -227,3 +229,16 @@ def test_every_run_to_attack_is_a_task(run, tmp_path, monkeypatch):
     for folder, task in zip(runs, tasks, strict=True):
         assert parse(evidence.Options, "evidence", task.flags) == dataclasses.replace(one, run=str(folder))
         assert (task.folder, task.command, task.last, task.adds) == (folder, "evidence", "evidence.json", True)
+
+
+def test_evidence_of_another_scale_does_not_count_as_finished(run, printed, tmp_path, monkeypatch, refused):
+    several = evidence.Options(run=f"{run},{shutil.copytree(run, tmp_path / 'b')}", **SMALL)
+    larger = dataclasses.replace(several, episodes=SMALL["episodes"] + 1)
+    found = f"{run / 'evidence.json'}: of {SMALL['episodes']} episodes a clip and 1 training(s) of each kind; "
+    wanted = f"accepted: {SMALL['episodes'] + 1} and 1; attack this run alone, or remove the file"
+    assert refused(evidence.main, larger) == found + wanted
+    given = []
+    monkeypatch.setattr(executor, "run_tasks", lambda tasks, **how: given.extend(tasks) or {})
+    evidence.main(several)
+    evidence.main(dataclasses.replace(several, fakes=True))
+    assert [task.last for task in given] == ["evidence.json"] * 2 + ["fakes.json"] * 2

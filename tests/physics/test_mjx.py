@@ -172,6 +172,37 @@ def test_warp_has_room_for_every_contact_and_joint_limit(robot, engine):
     assert (PhysicsConfig().warp_contacts, PhysicsConfig().warp_constraints) == PAPER_ROOM
 
 
+CAPSULE = """
+<mujoco><worldbody><geom type="plane" size="1 1 1"/>
+<body><freejoint/><geom type="capsule" size="0.05 0.2"/></body></worldbody></mujoco>
+"""
+
+
+def test_only_the_friction_of_a_capsule_within_30_degrees_of_upright_is_turned_by_another_rule():
+    """docs/architecture.md says so; a robot that crawls has such capsules. It stands on the floor, 1 mm deep."""
+    model = mujoco.MjModel.from_xml_string(CAPSULE)
+    data, tilts = mujoco.MjData(model), np.radians([0, 20, 29, 31, 60])
+    poses, native = np.zeros((len(tilts), 7)), []
+    for pose, tilt in zip(poses, tilts, strict=True):
+        pose[2:] = 0.049 + 0.2 * np.cos(tilt), np.cos(tilt / 2), 0.0, np.sin(tilt / 2), 0.0
+        data.qpos[:] = pose
+        mujoco.mj_forward(model, data)
+        native.append(data.contact.frame[0].reshape(3, 3))
+    on_mjx, start = mujoco.mjx.put_model(model), mujoco.mjx.put_data(model, data)
+
+    @jax.jit
+    @jax.vmap
+    def contacts(qpos):
+        return mujoco.mjx.collision(on_mjx, mujoco.mjx.kinematics(on_mjx, start.replace(qpos=qpos)))._impl.contact
+
+    found = contacts(jnp.asarray(poses))
+    lower = np.argmin(found.dist, axis=1)
+    frames = np.asarray(found.frame)[np.arange(len(tilts)), lower]
+    np.testing.assert_allclose(frames[:, 0], np.array(native)[:, 0], atol=1e-6)  # the normal
+    turned = np.abs(frames[:, 1:] - np.array(native)[:, 1:]).max(axis=(1, 2)) > 0.1
+    assert turned.tolist() == [True, True, True, False, False]
+
+
 def test_warp_that_is_not_installed_is_refused_in_one_line(robot, monkeypatch):
     monkeypatch.setattr(mujoco.mjx.warp, "WARP_INSTALLED", False)
     with pytest.raises(InputError, match=r"mjx-warp.*pip install 'mujoco-mjx\[warp\]'") as error:
@@ -196,9 +227,10 @@ def test_warp_step_equals_the_native_engines(warp_result, native_result, capfd):
 
 
 @needs_warp
-def test_warp_says_once_which_room_is_too_small(robot, inputs, warp_result, native_result, capfd):
+@pytest.mark.parametrize(("what", "least"), [("constraints", 20), ("contacts", 1)])
+def test_warp_says_once_which_room_is_too_small(robot, inputs, warp_result, native_result, capfd, what, least):
     """`warp_result` has started Warp, which says on a machine without CUDA that it has none."""
-    engine = MjxEngine(robot, SUBSTEPS, implementation="warp", room=PAPER_ROOM._replace(constraints=20))
+    engine = MjxEngine(robot, SUBSTEPS, implementation="warp", room=PAPER_ROOM._replace(**{what: least}))
     _say_full.cache_clear()
     step = jax.jit(engine.step)
     for _ in range(2):
@@ -207,8 +239,8 @@ def test_warp_says_once_which_room_is_too_small(robot, inputs, warp_result, nati
     jax.effects_barrier()
     said = " ".join(capfd.readouterr().err.split())
     assert said == (
-        "warning: physics.warp_constraints: 20 is too few, so contacts were left out of the simulation and the robot "
-        "moved wrongly; give more with --set physics.warp_constraints=40"
+        f"warning: physics.warp_{what}: {least} is too few, so contacts were left out of the simulation and the robot "
+        f"moved wrongly; give more with --set physics.warp_{what}={2 * least}"
     )
 
 

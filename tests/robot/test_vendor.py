@@ -418,6 +418,14 @@ def test_a_robot_that_gravity_does_not_pull_is_held_by_its_motors_alone(written,
     assert not hold(made(file)[0]).stands
 
 
+def test_a_robot_whose_simulation_diverges_does_not_stand(written, made):
+    """Its foot is a hundred thousand kilometres away."""
+    file = written(('left_foot" pos="0 0 -0.4"', 'left_foot" pos="0 99999999 -0.4"'))
+    held = hold(made(file)[0])
+    assert not held.stands
+    assert str(held).startswith("the simulation diverges; ")
+
+
 @pytest.mark.parametrize("name", ["vendor.xml", "shell.stl", "skin.png"])
 def test_a_git_lfs_pointer(run, written, tmp_path, name):
     files = '<mesh name="shell" file="shell.stl"/><texture name="skin" type="2d" file="skin.png"/>'

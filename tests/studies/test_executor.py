@@ -46,6 +46,9 @@ if flag["--seed"] == "6" or flag["--seed"] == "7" and "--resume" not in sys.argv
     os.kill(os.getpid(), signal.SIGKILL)
 if flag["--seed"] == "5":
     (folder / "threads").write_text(" ".join(os.environ[name] for name in ("PYTHON_CPU_COUNT", "NPROC")))
+if flag["--seed"] == "2":
+    of_launchers = ("SLURM_STEP", "JAX_NUM_PROC", "JAX_COORDINATOR", "JAX_PROCESS")
+    (folder / "started").write_text(str([name for name in os.environ if name.startswith(of_launchers)]))
 if flag["--seed"] in "23":
     (folder / "gpu").write_text(os.environ.get("CUDA_VISIBLE_DEVICES", "all"))
 time.sleep(60 if flag["--seed"] == "9" else 0.2)
@@ -113,6 +116,14 @@ def test_a_command_that_adds_to_a_run_finds_the_run_as_it_was(tmp_path):
     assert (run / "checkpoints" / "00000008").is_dir()
     assert (run / "evaluation.json").read_text() == "of the run"
     assert journal(tmp_path) == ["start 2", "end 2"]  # and no --resume
+
+
+def test_a_task_knows_nothing_of_the_processes_that_its_worker_was_started_with(tmp_path, monkeypatch):
+    for name in ("SLURM_STEP_NUM_TASKS", "JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID"):
+        monkeypatch.setenv(name, "8")
+    wanted = a_task(tmp_path, 2)
+    assert run_tasks([wanted], jobs=1, description="try") == {}
+    assert (wanted.folder / "started").read_text() == "[]"
 
 
 @pytest.mark.parametrize(("seeds", "code"), [((0, 2), None), ((0, 1), 1)])

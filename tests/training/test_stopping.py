@@ -43,7 +43,7 @@ def course(tiny_setup, monkeypatch, tmp_path):
     """A course of `turn`, looked at every 5 iterations, whose skill at iteration i is `curve[i]`."""
     unlearn = UnlearnConfig(("turn",), settings={"penalty": 16.0}, stop_every=5)
     ppo = dataclasses.replace(tiny_setup.config.ppo, base_kl=0.1)
-    config = dataclasses.replace(tiny_setup.config, iterations=100, evaluate_every=0, unlearn=unlearn, ppo=ppo)
+    config = dataclasses.replace(tiny_setup.config, iterations=300, evaluate_every=0, unlearn=unlearn, ppo=ppo)
     setup = dataclasses.replace(tiny_setup, config=config)
     looks = []
 
@@ -79,13 +79,13 @@ def through(course: Stopping, assets, start: int, end: int) -> tuple[list[tuple[
     return shares, position.iteration
 
 
-def test_the_step_size_falls_to_nothing_over_sixty_iterations_and_the_run_ends(course):
-    shares, end = through(course(), course.assets, 0, 100)
-    assert end == 75  # 15 and 60
+def test_the_step_size_falls_to_nothing_over_100_iterations_and_the_run_ends(course):
+    shares, end = through(course(), course.assets, 0, 300)
+    assert end == 115  # 15 and 100
     assert course.looks == [5, 10, 15]  # at the baseline at 10 and 15
     step_size, on_kept, on_target = zip(*shares, strict=True)
-    assert step_size == pytest.approx([1.0] * 15 + [1.0 - i / 60 for i in range(60)])
-    assert on_kept == pytest.approx([0.1] * 15 + [0.4] * 60)
+    assert step_size == pytest.approx([1.0] * 15 + [1.0 - i / 100 for i in range(100)])
+    assert on_kept == pytest.approx([0.1] * 15 + [0.6] * 100)
     assert set(on_target) == {0.0}
 
 
@@ -95,16 +95,16 @@ def test_a_run_without_a_kl_to_the_base_settles_without_one(course):
     resumed = SimpleNamespace(curriculum={"skills": [(5, 0.0), (10, 0.0)]})
     settling = course(resumed, dataclasses.replace(setup, config=without))
     focus = settling.begin(Position(SimpleNamespace(policy=20), course.assets, 20, 0)).assets.focus
-    assert (float(focus.settle), focus.base_kl) == (pytest.approx(1.0 - 10 / 60), None)
+    assert (float(focus.settle), focus.base_kl) == (pytest.approx(1.0 - 10 / 100), None)
 
 
-@pytest.mark.parametrize("stopped", [7, 10, 12, 15, 22, 75])
+@pytest.mark.parametrize("stopped", [7, 10, 12, 15, 22, 115])
 def test_a_run_that_was_stopped_ends_where_it_would_have(course, stopped):
-    whole, end = through(course(), course.assets, 0, 100)
+    whole, end = through(course(), course.assets, 0, 300)
     first = course()
     before, _ = through(first, course.assets, 0, stopped)
     resumed = course(SimpleNamespace(curriculum=first.curriculum))
-    after, found = through(resumed, course.assets, stopped, 100)
+    after, found = through(resumed, course.assets, stopped, 300)
     assert (before + after, found) == (whole, end)
     assert resumed.note == {"target_skill": 0.0}
 
