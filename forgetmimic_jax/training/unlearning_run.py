@@ -69,7 +69,7 @@ class Options:
     preset: Preset | None = None
     """Settings of the fine-tuning; by default the base's own, at the default budget of a laptop."""
     iterations: int | None = None
-    """PPO iterations; 640 by default, distill: 200, stand: 140 (with --preset paper 1000, 1000 and 400),
+    """PPO iterations; 640 by default, distill: 200, stand: 100 (with --preset paper 1000, 1000 and 400),
     retrain: as many steps as the base was trained for. With a stop rule the most of them."""
     no_stop: bool = False
     """Train all iterations. Without this flag arft, random_reward, negated_reward and gradient_ascent

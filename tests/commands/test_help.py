@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 
 from forgetmimic_jax import __main__ as program
+from forgetmimic_jax import unlearn
 from forgetmimic_jax.settings.options import parse
+from forgetmimic_jax.unlearning.registry import find_method
 
 PACKAGE = Path(program.__file__).parent
 HEAVY = {"numpy", "jax", "mujoco", "scipy", "matplotlib", "orbax"}  # what `--help` need not wait for
@@ -92,3 +94,15 @@ def test_a_wrong_flag_is_refused_with_what_is_accepted(arguments, message, capsy
         parse(Options, "train", arguments)
     assert exit_.value.code == 2
     assert message in capsys.readouterr().err
+
+
+def test_the_help_of_unlearn_has_the_methods_own_iterations(capsys):
+    with pytest.raises(SystemExit):
+        parse(unlearn.Options, "unlearn", ["--help"])
+    text = re.sub(r"[\s│]+", " ", capsys.readouterr().out)
+    arft, distill, stand = (find_method(name).pace.iterations for name in ("arft", "distill", "stand"))
+    by_preset = f"{arft['paper']}, {distill['paper']} and {stand['paper']}"
+    given = (
+        f"{arft['cpu']} by default, distill: {distill['cpu']}, stand: {stand['cpu']} (with --preset paper {by_preset})"
+    )
+    assert f"PPO iterations; {given}, retrain: as many steps as the base was trained for." in text
