@@ -62,10 +62,10 @@ PHASES = (  # of pretraining, short enough that a run passes all of them
     *("pretrain.distil_rounds=2", "pretrain.search_rounds=3", "pretrain.specialist_evaluations=2"),
 )
 MJX = (
-    *("unlearn", "--physics", "mjx", "--iterations", "3", "--episodes", "2"),
+    *("unlearn", "--physics", "mjx", "--iterations", "3", "--episodes", "1"),
     *("--set", "ppo.num_envs=64", "--set", "ppo.minibatches=2", "--set", "ppo.num_steps=8"),
 )
-MJX_LIMIT = 1800.0  # s; such a run takes some minutes, most of them to compile
+MJX_LIMIT = 1800.0  # s; such a run takes some minutes, most of them in the evaluation
 GROWTH = 0.05  # of the memory after a tenth of the time
 PAGE, TMPFS = 2**12, 2**28  # bytes, the least that a disk has, and more than any run here writes
 

@@ -161,7 +161,7 @@ def test_the_facts_lie_beside_it(facts, run):
     assert facts["evaluation"] == json.loads((run / "evaluation.json").read_text())
     assert facts["done"]["Penalty"] == "16"
     assert facts["done"]["Sampler"] == "uniform clips, starts from all clips, 50% on the targets"
-    assert facts["done"]["KL to the base"] == "weight 0.1, on kept clips; 4 times that while the run settles"
+    assert facts["done"]["KL to the base"] == "weight 0.1, on kept clips; 6 times that while the run settles"
 
 
 def test_a_method_with_a_weight_of_its_own_for_the_kept_clips_is_shown_with_it(run):
