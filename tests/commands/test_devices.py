@@ -291,7 +291,7 @@ def test_a_number_of_devices_that_does_not_fit_is_refused(main, options, refused
 
 
 def test_processes_that_do_not_fit_are_refused(refused, library_folder, monkeypatch):
-    options = train.Options(output=Path("run"), library=library_folder, devices=4)
+    options = train.Options(output=Path("run"), library=library_folder, devices=4, iterations=1)
     monkeypatch.setenv("JAX_COORDINATOR_ADDRESS", "127.0.0.1:1")
     assert refused(train.main, options) == (
         "JAX_NUM_PROCESSES: found ''; accepted: a whole number, beside JAX_COORDINATOR_ADDRESS"
